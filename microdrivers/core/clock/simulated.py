@@ -1,0 +1,175 @@
+"""Virtual time: deterministic, single-threaded, as fast as the processor."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from microdrivers.core.clock.base import Clock, ClockError, ClockEvent, Timer
+from microdrivers.core.units import seconds_to_ns
+
+
+class SimulatedClock(Clock):
+    """Calls happen in the order of their times while the main program waits; equal times keep their order of entry.
+
+    There are two kinds of time. *Global* time moves when the main program waits. *Local* time belongs to one
+    activity (a callback, or an exchange of the main program): it may run ahead of global time without
+    dispatching anything, as a thread that blocks on a port would. An exchange of the main program is caught up
+    with when it ends: what fell due meanwhile is dispatched then, in order.
+    """
+
+    simulated = True
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._global_ns = start_ns
+        self._local_ns: int | None = None
+        self._in_callback = False
+        self._transactions = 0
+        self._queue: list[tuple[int, int, _Call]] = []
+        self._numbers = itertools.count()
+        self._thread = threading.get_ident()
+
+    def now_ns(self) -> int:
+        return self._global_ns if self._local_ns is None else self._local_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        self._check_thread()
+        if self._transactions:
+            self._local_ns = max(self.now_ns(), t_ns)
+        elif self._in_callback:
+            raise ClockError(
+                "a clock callback must not wait",
+                remedy="exchange inside clock.transaction(), or schedule the rest with clock.call_at()",
+            )
+        else:
+            self._dispatch_until(t_ns)
+
+    def call_at(self, t_ns: int, call: Callable[[], object], *, name: str = "") -> Timer:
+        pending = _Call(call, name)
+        self._push(t_ns, pending)
+        return pending
+
+    def every(
+        self, period_s: float, call: Callable[[], object], *, start_ns: int | None = None, name: str = ""
+    ) -> Timer:
+        period_ns = seconds_to_ns(period_s)
+        if period_ns <= 0:
+            raise ClockError(f"the period of {name or 'a periodic call'} must be positive, not {period_s} s")
+        first_ns = self.now_ns() if start_ns is None else start_ns
+        beat = _Call(lambda: None, name)
+        due_ns = first_ns
+
+        def run() -> None:
+            nonlocal due_ns
+            call()
+            late = max(0, self.now_ns() - due_ns)
+            due_ns += period_ns * max(1, -(-late // period_ns))
+            if not beat.cancelled:
+                self._push(due_ns, beat)
+
+        beat.call = run
+        self._push(first_ns, beat)
+        return beat
+
+    def deliver(self, call: Callable[[], object]) -> None:
+        if self._local_ns is None or self._local_ns <= self._global_ns:
+            call()
+        else:
+            self.call_at(self._local_ns, call)
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        self._check_thread()
+        if self._local_ns is None:
+            self._local_ns = self._global_ns
+        self._transactions += 1
+        try:
+            yield
+        finally:
+            self._transactions -= 1
+            if not self._transactions and not self._in_callback:
+                end_ns, self._local_ns = self._local_ns, None
+                self._dispatch_until(end_ns)
+
+    def event(self) -> ClockEvent:
+        return _SimulatedEvent(self)
+
+    def close(self) -> None:
+        self._queue.clear()
+
+    def wait_for(self, reached: Callable[[], bool], deadline_ns: int) -> None:
+        """Dispatch until `reached()` or `deadline_ns`, the main program's only other way to wait."""
+        self._check_thread()
+        if self._in_callback or self._transactions:
+            raise ClockError("a clock callback must not wait", remedy="schedule the rest with clock.call_at()")
+        while not reached() and self._queue and self._queue[0][0] <= deadline_ns:
+            self._dispatch_next()
+        if not reached():
+            self._global_ns = max(self._global_ns, deadline_ns)
+
+    def _push(self, t_ns: int, call: _Call) -> None:
+        heapq.heappush(self._queue, (max(t_ns, self._global_ns), next(self._numbers), call))
+
+    def _dispatch_until(self, t_ns: int) -> None:
+        while self._queue and self._queue[0][0] <= t_ns:
+            self._dispatch_next()
+        self._global_ns = max(self._global_ns, t_ns)
+
+    def _dispatch_next(self) -> None:
+        due_ns, _, pending = heapq.heappop(self._queue)
+        if pending.cancelled:
+            return
+        self._global_ns = max(self._global_ns, due_ns)
+        self._in_callback, self._local_ns = True, due_ns
+        try:
+            pending.call()
+        finally:
+            self._in_callback, self._local_ns, self._transactions = False, None, 0
+
+    def _check_thread(self) -> None:
+        if threading.get_ident() != self._thread:
+            raise ClockError(
+                "a simulated clock belongs to the thread that made it",
+                remedy="use SystemClock in programs with threads of their own",
+            )
+
+
+class _Call:
+    """One entry of the queue."""
+
+    __slots__ = ("call", "cancelled", "name")
+
+    def __init__(self, call: Callable[[], object], name: str) -> None:
+        self.call = call
+        self.name = name
+        self.cancelled = False
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+
+class _SimulatedEvent:
+    def __init__(self, clock: SimulatedClock) -> None:
+        self._clock = clock
+        self._set_at_ns: int | None = None
+
+    def set(self) -> None:
+        if self._set_at_ns is None:
+            self._set_at_ns = self._clock.now_ns()
+
+    def is_set(self) -> bool:
+        return self._set_at_ns is not None
+
+    def clear(self) -> None:
+        self._set_at_ns = None
+
+    def wait(self, timeout_s: float) -> bool:
+        self._clock.wait_for(self.is_set, self._clock.now_ns() + seconds_to_ns(timeout_s))
+        if self._set_at_ns is None:
+            return False
+        # Whoever set it may have been ahead of global time; the effect must not precede its cause.
+        self._clock.sleep_until(self._set_at_ns)
+        return True

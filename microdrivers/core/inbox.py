@@ -1,0 +1,124 @@
+"""A bounded queue between the bus and one consumer, which remembers the order of arrival."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, Protocol
+
+from microdrivers.core.bus import Subscription, Topic
+from microdrivers.core.clock import Clock, Timer
+from microdrivers.core.samples import Sample
+
+OverflowPolicy = Literal["block", "drop_oldest"]
+
+_IDLE_POLL_S = 0.001
+
+
+class Consumer(Protocol):
+    """An estimator as a host sees it: samples in, estimates out."""
+
+    def update(self, sample: Sample) -> Iterable[Sample]:
+        """Take one sample, return the estimates it gave rise to."""
+
+
+class Inbox:
+    """Samples of several topics in one line, in order of arrival.
+
+    Args:
+        capacity: how many samples may wait.
+        policy: what happens when it is full: `block` makes the publisher wait for the consumer, `drop_oldest`
+            forgets the oldest sample and counts it in `dropped`.
+    """
+
+    def __init__(self, *, capacity: int = 1024, policy: OverflowPolicy = "block") -> None:
+        self.capacity = capacity
+        self.policy = policy
+        self.dropped = 0
+        self.arrivals: list[int] = []
+        """Bus-wide order numbers in the order of arrival: what a replay must reproduce."""
+        self._waiting: deque[Sample] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, sample: Sample) -> None:
+        """Append a sample; the policy says what happens when there is no room."""
+        with self._changed:
+            while len(self._waiting) >= self.capacity and not self._closed:
+                if self.policy == "drop_oldest":
+                    self._waiting.popleft()
+                    self.dropped += 1
+                else:
+                    self._changed.wait()
+            self._waiting.append(sample)
+            self.arrivals.append(sample.order)
+            self._changed.notify_all()
+
+    def take(self) -> Sample | None:
+        """The oldest waiting sample, or None if there is none."""
+        with self._changed:
+            if not self._waiting:
+                return None
+            sample = self._waiting.popleft()
+            self._changed.notify_all()
+            return sample
+
+    def close(self) -> None:
+        """Release a publisher that waits for room."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+
+class EstimatorHost:
+    """Runs one estimator behind one inbox and publishes what it returns.
+
+    On a simulated clock the estimator runs as the samples arrive; in real time it has a thread of its own. Either
+    way it sees the samples in `inbox.arrivals` order, so that feeding a recording in that order gives the same bits.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        consumer: Consumer,
+        inputs: Iterable[Topic[Any]],
+        publish: Callable[[Sample], object],
+        *,
+        capacity: int = 1024,
+        keep_samples: bool = False,
+    ) -> None:
+        self.inbox = Inbox(capacity=capacity)
+        self.recorded: list[Sample] = []
+        self._keep_samples = keep_samples
+        self._consumer = consumer
+        self._publish = publish
+        arrived = self._arrived_inline if clock.simulated else self.inbox.put
+        self._subscriptions: list[Subscription] = [topic.subscribe(arrived) for topic in inputs]
+        self._timer: Timer | None = None
+        if not clock.simulated:
+            self._timer = clock.every(_IDLE_POLL_S, self.work, name="estimator")
+
+    def work(self) -> None:
+        """Consume everything that waits."""
+        while (sample := self.inbox.take()) is not None:
+            if self._keep_samples:
+                self.recorded.append(sample)
+            for estimate in self._consumer.update(sample):
+                self._publish(estimate)
+
+    def close(self) -> None:
+        """Consume what is left and stop listening."""
+        for subscription in self._subscriptions:
+            subscription.cancel()
+        if self._timer is not None:
+            self._timer.cancel()
+        self.work()
+        self.inbox.close()
+
+    def _arrived_inline(self, sample: Sample) -> None:
+        self.inbox.put(sample)
+        self.work()

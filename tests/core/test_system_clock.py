@@ -1,0 +1,62 @@
+"""The system clock: real threads, whose errors cannot go unnoticed."""
+
+import threading
+
+import pytest
+
+from microdrivers.core.clock import SystemClock
+
+
+@pytest.fixture
+def clock():
+    clock = SystemClock()
+    yield clock
+    clock.close()
+
+
+def test_periodic_calls_run_in_a_thread_of_their_own_until_cancelled(clock):
+    event, threads = clock.event(), set()
+
+    def beat():
+        threads.add(threading.get_ident())
+        event.set()
+
+    timer = clock.every(0.001, beat)
+    assert event.wait(2.0)
+    timer.cancel()
+    event.clear()
+    assert not event.wait(0.02)
+    assert threading.get_ident() not in threads
+
+
+def test_an_error_in_a_callback_is_raised_in_the_main_program(clock):
+    failed = clock.event()
+
+    def fail():
+        failed.set()
+        raise LookupError("no such axis")
+
+    clock.every(0.001, fail)
+    assert failed.wait(2.0)
+    clock.every(0.001, lambda: None).cancel()
+    with pytest.raises(LookupError, match="no such axis"):
+        for _ in range(100):
+            clock.sleep(0.005)
+
+
+def test_a_callback_may_cancel_itself(clock):
+    calls, done = [], clock.event()
+
+    def once():
+        calls.append(1)
+        timer.cancel()
+        done.set()
+
+    timer = clock.every(0.001, once, start_ns=clock.now_ns() + 5_000_000)
+    assert done.wait(2.0)
+    clock.sleep(0.02)
+    assert calls == [1]
+
+
+def test_sleep_until_the_past_returns_at_once(clock):
+    clock.sleep_until(clock.now_ns() - 1)
