@@ -1,0 +1,38 @@
+"""Rig-file settings of a camera."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from microdrivers.devices.drivers import DeviceSettings
+
+_Pixels = Annotated[int, pydantic.Field(gt=0, le=20_000)]
+
+
+class CameraDeviceSettings(DeviceSettings):
+    """A camera.
+
+    `source` is a URL whose scheme names a frame source. `sensor_size_px` is width, height; `principal_point_px` is
+    where the optical axis meets the sensor, full-sensor pixels from the centre of the top-left pixel (default: the
+    middle). `arrival_delay_ms` ± `arrival_uncertainty_ms` (95 %) say how long after mid-exposure a frame arrives;
+    they are used only for sources that cannot tell the time of capture.
+    """
+
+    driver: Literal["camera"] = "camera"
+    source: str = pydantic.Field(pattern=r"^[a-z0-9+]+://")
+    sensor_size_px: tuple[_Pixels, _Pixels]
+    pixel_pitch_um: float = pydantic.Field(gt=0, le=100)
+    principal_point_px: tuple[float, float] | None = None
+    rate_hz: float = pydantic.Field(default=30.0, gt=0, le=10_000)
+    exposure_ms: float = pydantic.Field(default=2.0, gt=0)
+    gain: float = pydantic.Field(default=1.0, gt=0)
+    arrival_delay_ms: float = pydantic.Field(default=20.0, ge=0)
+    arrival_uncertainty_ms: float = pydantic.Field(default=20.0, gt=0)
+
+    @pydantic.model_validator(mode="after")
+    def _exposure_fits(self) -> CameraDeviceSettings:
+        if self.exposure_ms * self.rate_hz > 1000:
+            raise ValueError(f"exposure_ms = {self.exposure_ms:g} does not fit rate_hz = {self.rate_hz:g}")
+        return self

@@ -1,0 +1,1 @@
+"""Lines: a port, a lock, and bytes in and out in time."""

@@ -1,0 +1,8 @@
+"""An emulated camera on the simulated microscope."""
+
+from microdrivers.devices.drivers import Emulator
+from microdrivers.fakes.camera.source import attach
+
+__all__ = ["EMULATOR"]
+
+EMULATOR = Emulator(attach=attach)

@@ -1,0 +1,13 @@
+"""An emulated serial line: baud pacing, delays and seeded fragments between a driver and an emulator."""
+
+from microdrivers.fakes.wire.wire import (
+    Reply,
+    Temper,
+    Wire,
+    WireEmulator,
+    forget_wire,
+    register_wire,
+    wire_named,
+)
+
+__all__ = ["Reply", "Temper", "Wire", "WireEmulator", "forget_wire", "register_wire", "wire_named"]

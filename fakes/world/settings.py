@@ -1,0 +1,81 @@
+"""A world file: what only a simulation knows. Every value is the centre or the spread of what a seed draws."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pydantic
+
+from microdrivers.devices.drivers import DeviceSettings
+
+
+class StageWorld(DeviceSettings):
+    """The sample stage's mechanics; noises are standard deviations, spreads are those of normal draws."""
+
+    servo_lag_ms: float = pydantic.Field(default=4.0, gt=0)
+    lost_motion_um: float = pydantic.Field(default=0.5, ge=0)
+    lost_motion_deg: float = pydantic.Field(default=5e-4, ge=0)
+    encoder_noise_um: float = pydantic.Field(default=0.010, ge=0)
+    encoder_noise_deg: float = pydantic.Field(default=1e-5, ge=0)
+    power_on_spread_um: float = pydantic.Field(default=1500.0, ge=0)
+    latch_delay_ms: float = pydantic.Field(default=0.05, ge=0)
+    latch_spread_ms: float = pydantic.Field(default=0.0255, ge=0)
+    drift_spread_um_s: float = pydantic.Field(default=0.003, ge=0)
+
+
+class ZoomWorld(DeviceSettings):
+    """The zoom body behind the motor: play of the gear, and how far the optics differ from the engraved curve."""
+
+    lost_motion_steps: float = pydantic.Field(default=8.0, ge=0)
+    servo_lag_ms: float = pydantic.Field(default=1.0, gt=0)
+    start_zoom: tuple[float, float] = (0.8, 1.1)
+    curve_spread: float = pydantic.Field(default=0.003, ge=0)
+
+
+class OpticsWorld(DeviceSettings):
+    """The microscope. The angle is drawn from the whole circle, the handedness is tossed."""
+
+    working_distance_um: float = pydantic.Field(default=45_000.0, gt=0)
+    tilt_spread_deg: float = pydantic.Field(default=0.25, ge=0)
+    boresight_spread_px: float = pydantic.Field(default=3.0, ge=0)
+
+
+class CameraWorld(DeviceSettings):
+    """The camera's times: delivery after the exposure's end, and the error of its own stamps.
+
+    The stamp error is drawn once a world, normal with `stamp_spread_ms`; `stated_uncertainty_ms` is what the data
+    sheet says of it, the half-width of the 95 % interval.
+    """
+
+    delivery_ms: tuple[float, float] = (6.0, 18.0)
+    delivery_jitter_ms: float = pydantic.Field(default=1.0, ge=0)
+    stamp_spread_ms: float = pydantic.Field(default=0.051, ge=0)
+    stamp_jitter_ms: float = pydantic.Field(default=0.005, ge=0)
+    stated_uncertainty_ms: float = pydantic.Field(default=0.1, gt=0)
+
+
+class TargetWorld(DeviceSettings):
+    """The square on the slide, and the dust around it."""
+
+    side_um: float = pydantic.Field(default=400.0, gt=0)
+    offset_um: float = pydantic.Field(default=450.0, ge=0)
+    background_levels: tuple[float, float] = (90.0, 130.0)
+    contrast_levels: tuple[float, float] = (100.0, 120.0)
+    polarity: Literal["drawn", "dark", "bright"] = "drawn"
+    blur_px: tuple[float, float] = (1.0, 1.5)
+    noise_levels: float = pydantic.Field(default=2.0, ge=0)
+    gradient_levels: float = pydantic.Field(default=6.0, ge=0)
+    specks: int = pydantic.Field(default=12, ge=0, le=500)
+    visible: bool = True
+
+
+class WorldSettings(DeviceSettings):
+    """A microscope that looks at a square on an XYθ stage."""
+
+    schema_version: Literal[1] = 1
+    world: Literal["microscope"] = "microscope"
+    stage: StageWorld = StageWorld()
+    zoom: ZoomWorld = ZoomWorld()
+    optics: OpticsWorld = OpticsWorld()
+    camera: CameraWorld = CameraWorld()
+    target: TargetWorld = TargetWorld()

@@ -1,0 +1,1 @@
+"""The interfaces that drivers implement and users program against."""

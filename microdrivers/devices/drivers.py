@@ -1,0 +1,109 @@
+"""How drivers, emulators and worlds announce themselves.
+
+Three entry-point groups: `microdrivers.drivers` (a `Driver` by name), `microdrivers.emulators` (an `Emulator` under
+the same name as the driver that it is the other end of) and `microdrivers.worlds` (a `WorldType` by name). The
+framework names none of them; a third party's package adds its own. See docs/decisions/0005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+import pydantic
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
+from microdrivers.devices.base import Device
+
+
+class DeviceSettings(pydantic.BaseModel):
+    """Base of a driver's settings in the rig file: unknown keys are refused, values are not converted silently."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
+
+
+@dataclass(frozen=True)
+class Driver(Generic[SettingsT]):
+    """One real device type.
+
+    Attributes:
+        kind: the interface that the device implements.
+        settings: model of its part of the rig file.
+        create: builds the device, closed, from its name, its settings, the clock and the bus.
+    """
+
+    kind: type[Device[Any]]
+    settings: type[SettingsT]
+    create: Callable[[str, SettingsT, Clock, Bus], Device[Any]]
+
+
+class World(Protocol):
+    """The physical world that the emulators of a rig share."""
+
+    def close(self) -> None:
+        """Release what the world holds."""
+
+
+@dataclass(frozen=True)
+class WorldRequest(Generic[SettingsT]):
+    """What a world is built from: the world file's settings, the whole rig file as plain data, and a seed."""
+
+    settings: SettingsT
+    rig: Mapping[str, Any]
+    seed: int
+    clock: Clock
+    bus: Bus
+
+
+@dataclass(frozen=True)
+class WorldType(Generic[SettingsT]):
+    """One kind of simulated world, with the model of its file's settings."""
+
+    settings: type[SettingsT]
+    build: Callable[[WorldRequest[SettingsT]], World]
+
+
+@dataclass(frozen=True)
+class EmulationRequest:
+    """What an emulator is built from.
+
+    Attributes:
+        name: the device's name in the rig file.
+        settings: the device's validated settings as plain data.
+        world: what the emulators share.
+        seed: of the emulator's own draws (delays, fragments, noise).
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    world: World
+    seed: int
+    clock: Clock
+    bus: Bus
+
+
+@dataclass(frozen=True)
+class Emulation:
+    """A running emulator.
+
+    Attributes:
+        overrides: merged over the device's settings, so that the driver connects to the emulator.
+        close: ends the emulator.
+        wire_log: what passed on the wire, as (t_ns, "host" | "device", bytes), if the device has one.
+    """
+
+    overrides: Mapping[str, Any]
+    close: Callable[[], None]
+    wire_log: list[tuple[int, str, bytes]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """The other end of a driver's wire."""
+
+    attach: Callable[[EmulationRequest], Emulation]
