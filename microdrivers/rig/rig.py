@@ -1,0 +1,160 @@
+"""An open rig: all devices, one clock, one bus, and a certain end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock, SystemClock
+from microdrivers.core.errors import ConnectError, ErrorTree, MicrodriversError, UnsupportedError
+from microdrivers.devices.base import Device
+from microdrivers.rig.rig_file import RigDescription, RigFile, load_rig_file
+from microdrivers.rig.simulation import Simulation
+
+DeviceT = TypeVar("DeviceT", bound=Device[Any])
+
+_log = logging.getLogger(__name__)
+
+
+class Rig:
+    """All devices of a rig file, as a context manager.
+
+    Opening connects and identifies and moves nothing; leaving stops everything, in any case, and closes it.
+    """
+
+    def __init__(
+        self, description: RigDescription, *, clock: Clock, bus: Bus, simulation: Simulation | None = None
+    ) -> None:
+        self.description = description
+        self.clock = clock
+        self.bus = bus
+        self.simulation = simulation
+        self.devices: dict[str, Device[Any]] = {}
+        for name, entry in description.devices.items():
+            settings = entry.settings if simulation is None else simulation.settings_of(name)
+            self.devices[name] = entry.driver.create(name, settings, clock, bus)
+
+    @property
+    def file(self) -> RigFile:
+        """The rig file's own content."""
+        return self.description.rig
+
+    @property
+    def fake(self) -> bool:
+        """Whether the devices are emulated."""
+        return self.simulation is not None
+
+    def device(self, name: str, kind: type[DeviceT]) -> DeviceT:
+        """The device of that name, typed.
+
+        Raises:
+            UnsupportedError: there is none of that name, or it is of another kind.
+        """
+        device = self.devices.get(name)
+        if not isinstance(device, kind):
+            found = "missing" if device is None else f"a {type(device).__name__}"
+            raise UnsupportedError(
+                f"device {name!r} of rig {self.file.name!r} is {found}, not a {kind.__name__}",
+                remedy=f"name one of {', '.join(self.devices)}",
+            )
+        return device
+
+    def open(self) -> None:
+        """Open all devices.
+
+        Raises:
+            ConnectError: with every failure; what had been opened is closed again.
+        """
+        failures: list[MicrodriversError] = []
+        for device in self.devices.values():
+            try:
+                device.open()
+            except MicrodriversError as error:
+                failures.append(error)
+        if failures:
+            self.close()
+            raise ConnectError(f"{len(failures)} of {len(self.devices)} devices could not be opened:", failures)
+
+    def stop(self, *, by: str = "user", reason: str = "") -> None:
+        """Stop all motion of all devices now.
+
+        Raises:
+            ErrorTree: stop commands that could not be sent; all others were.
+        """
+        failures = []
+        for device in self.devices.values():
+            try:
+                device.stop(by=by, reason=reason)
+            except MicrodriversError as error:
+                failures.append(error)
+        if failures:
+            raise ErrorTree("not every device could be told to stop:", failures, remedy="use the emergency stop")
+
+    def close(self) -> None:
+        """Stop everything, then close everything; whatever fails is logged and does not keep the rest from it."""
+        try:
+            self.stop(by="rig", reason="closing")
+        except ErrorTree as error:
+            _log.error("%s", error)
+        for device in self.devices.values():
+            try:
+                device.close()
+            except MicrodriversError as error:
+                _log.error("%s", error)
+        if self.simulation is not None:
+            self.simulation.close()
+        self.clock.close()
+
+    def __enter__(self) -> Rig:
+        try:
+            self.open()
+        except KeyboardInterrupt:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def build_rig(
+    file: Path, *, fake: bool = False, seed: int = 0, clock: Clock | None = None, world: Path | None = None
+) -> Rig:
+    """Read a rig file and build its devices, closed. See `open_rig`."""
+    description = load_rig_file(file)
+    clock = clock if clock is not None else SystemClock()
+    bus = Bus()
+    simulation = Simulation(description, clock=clock, bus=bus, seed=seed, world_file=world) if fake else None
+    return Rig(description, clock=clock, bus=bus, simulation=simulation)
+
+
+@contextmanager
+def open_rig(
+    file: Path | str,
+    *,
+    fake: bool = False,
+    seed: int = 0,
+    clock: Clock | None = None,
+    world: Path | None = None,
+) -> Iterator[Rig]:
+    """Open a rig; a context manager.
+
+    Args:
+        file: the rig file.
+        fake: replace every connection by its emulator.
+        seed: which simulated world to draw.
+        clock: default is real time; give a `SimulatedClock` to let an emulated rig run as fast as the processor.
+        world: a world file for the simulation.
+
+    Raises:
+        ConfigError: the file is wrong. ConnectError: devices could not be opened, all failures at once.
+    """
+    with build_rig(Path(file), fake=fake, seed=seed, clock=clock, world=world) as rig:
+        yield rig

@@ -1,0 +1,160 @@
+"""The rig file: one YAML file that describes a rig, the same on hardware and on emulators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+
+from microdrivers.core.errors import ConfigError
+from microdrivers.devices.drivers import DeviceSettings, Driver
+from microdrivers.rig.registry import find_driver, known_drivers
+from microdrivers.rig.yaml_file import Document, raise_all, read_document, validate
+
+DeviceName = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+class Frames(DeviceSettings):
+    """Which way the world frame's axes point, and its handedness; all positions of the rig are in it."""
+
+    x: str
+    y: str
+    z: str
+    handedness: Literal["right", "left"]
+
+
+class SquareTarget(DeviceSettings):
+    """A square pattern; one of its corners is tracked."""
+
+    kind: Literal["square"] = "square"
+    side_um: float = pydantic.Field(gt=0)
+
+
+class TextureTarget(DeviceSettings):
+    """Natural texture; a fixed template is tracked."""
+
+    kind: Literal["texture"]
+
+
+class MicroscopeSection(DeviceSettings):
+    """Which devices make up the microscope, and its fixed optics.
+
+    `objective` and `adapter` multiply the zoom body's reading: magnification = zoom × objective × adapter.
+    """
+
+    sample_stage: DeviceName
+    zoom: DeviceName
+    camera: DeviceName
+    objective: float = pydantic.Field(gt=0)
+    adapter: float = pydantic.Field(default=1.0, gt=0)
+    target: SquareTarget | TextureTarget = pydantic.Field(discriminator="kind")
+
+
+class RigFile(DeviceSettings):
+    """The whole file; each device's section is checked by its driver's own model."""
+
+    schema_version: Literal[1]
+    name: str = pydantic.Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")
+    description: str = ""
+    frames: Frames
+    microscope: MicroscopeSection | None = None
+    devices: dict[DeviceName, dict[str, Any]] = pydantic.Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class DeviceEntry:
+    """One device of a rig: its driver and its checked settings."""
+
+    name: str
+    driver_name: str
+    driver: Driver[Any]
+    settings: DeviceSettings
+
+
+@dataclass(frozen=True)
+class RigDescription:
+    """A rig file that has been read and checked completely."""
+
+    file: Path
+    rig: RigFile
+    devices: Mapping[str, DeviceEntry]
+
+    def as_data(self) -> dict[str, Any]:
+        """The whole rig as plain data with all defaults filled in, as worlds and provenance need it."""
+        data = self.rig.model_dump(mode="json", exclude={"devices"})
+        data["devices"] = {name: entry.settings.model_dump(mode="json") for name, entry in self.devices.items()}
+        return data
+
+
+def load_rig_file(file: Path) -> RigDescription:
+    """Read and check a rig file without touching hardware.
+
+    Raises:
+        ConfigError, ConfigErrors: every mistake, with file, line, column and what to do.
+    """
+    document = read_document(file)
+    rig, errors = validate(RigFile, document.data, document)
+    if rig is None:
+        # Look into the devices even if the frame around them is wrong: all mistakes at once.
+        sections = document.data.get("devices") if isinstance(document.data, dict) else None
+        if isinstance(sections, dict):
+            errors += _load_devices(sections, document)[1]
+        raise_all(document, errors)
+        raise AssertionError("unreachable: a rig that failed validation has errors")
+    devices, errors = _load_devices(rig.devices, document)
+    errors += _check_roles(rig, devices, document)
+    raise_all(document, errors)
+    return RigDescription(file=file, rig=rig, devices=devices)
+
+
+def _load_devices(sections: Mapping[str, Any], document: Document) -> tuple[dict[str, DeviceEntry], list[ConfigError]]:
+    devices: dict[str, DeviceEntry] = {}
+    errors: list[ConfigError] = []
+    for name, section in sections.items():
+        where = ("devices", name)
+        driver_name = section.get("driver") if isinstance(section, dict) else None
+        if not isinstance(driver_name, str):
+            errors.append(
+                document.error("the device names no driver", where, remedy=f"add driver: one of {known_drivers()}")
+            )
+            continue
+        driver = find_driver(driver_name)
+        if driver is None:
+            errors.append(
+                document.error(
+                    f"no driver {driver_name!r} is installed", (*where, "driver"),
+                    remedy=f"use one of {', '.join(known_drivers())}, or install the package that provides it",
+                )
+            )  # fmt: skip
+            continue
+        settings, found = validate(driver.settings, section, document, where)
+        errors += found
+        if settings is not None:
+            devices[name] = DeviceEntry(name, driver_name, driver, settings)
+    return devices, errors
+
+
+def _check_roles(rig: RigFile, devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:
+    """The microscope's devices must exist and be of the right kind."""
+    from microdrivers.devices.camera import Camera
+    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.zoom_motor import ZoomMotor
+
+    if rig.microscope is None:
+        return []
+    errors = []
+    for role, kind in (("sample_stage", XYThetaStage), ("zoom", ZoomMotor), ("camera", Camera)):
+        name = getattr(rig.microscope, role)
+        where = ("microscope", role)
+        if name not in rig.devices:
+            remedy = f"name one of {', '.join(rig.devices)}"
+            errors.append(document.error(f"there is no device {name!r} in this file", where, remedy=remedy))
+        elif name in devices and not issubclass(devices[name].driver.kind, kind):
+            found = devices[name].driver.kind.__name__
+            errors.append(
+                document.error(f"{name!r} is a {found}, not a {kind.__name__}", where, remedy="name another device")
+            )
+    return errors

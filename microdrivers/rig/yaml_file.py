@@ -1,0 +1,164 @@
+"""YAML with a memory of where everything stood, so that an error can name file, line and column."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import pydantic
+import yaml
+
+from microdrivers.core.errors import ConfigError, ConfigErrors
+
+Location = tuple[str | int, ...]
+ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
+
+
+class Place(NamedTuple):
+    """Line and column, both from 1."""
+
+    line: int
+    column: int
+
+
+class Document(NamedTuple):
+    """A YAML file as plain data, and the place of every key and value in it."""
+
+    file: Path
+    data: Any
+    places: dict[Location, Place]
+
+    def place_of(self, location: Sequence[str | int]) -> Place:
+        """The place of a location, or of the nearest thing around it that the file does contain."""
+        known = tuple(location)
+        while known and known not in self.places:
+            known = known[:-1]
+        return self.places.get(known, Place(1, 1))
+
+    def error(self, what: str, location: Sequence[str | int], *, remedy: str = "") -> ConfigError:
+        """An error at a location of this file."""
+        line, column = self.place_of(location)
+        key = ".".join(str(part) for part in location)
+        return ConfigError(what, remedy=remedy, file=str(self.file), line=line, column=column, key=key)
+
+
+class _CoreLoader(yaml.SafeLoader):
+    """YAML 1.2's core schema: 1e-5 is a number, `on`, `12:30` and dates are text."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own name
+
+
+for _tag, _pattern, _first in (
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("int", r"^[-+]?[0-9]+$", "-+0123456789"),
+    ("float", r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$", "-+.0123456789"),
+    ("float", r"^(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$", "-+."),
+):
+    _CoreLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
+
+
+def read_document(file: Path) -> Document:
+    """Read a YAML file.
+
+    Raises:
+        ConfigError: it does not exist, is not text, is no valid YAML, or repeats a key.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError("there is no such file", file=str(file), remedy="check the path") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", file=str(file), remedy="give a YAML text file") from error
+    loader = _CoreLoader(text)
+    try:
+        root = loader.get_single_node()
+        places: dict[Location, Place] = {}
+        if root is not None:
+            _note_places(root, (), places, file)
+        data = loader.construct_document(root) if root is not None else None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = Place(mark.line + 1, mark.column + 1) if mark else Place(1, 1)
+        raise ConfigError(
+            f"not valid YAML: {error.problem}",
+            file=str(file), line=place.line, column=place.column,
+            remedy="check indentation, colons and quotes around that place",
+        ) from error  # fmt: skip
+    finally:
+        loader.dispose()
+    return Document(file, data, places)
+
+
+def _note_places(node: yaml.Node, location: Location, places: dict[Location, Place], file: Path) -> None:
+    places.setdefault(location, Place(node.start_mark.line + 1, node.start_mark.column + 1))
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            inner = (*location, str(key.value))
+            place = Place(key.start_mark.line + 1, key.start_mark.column + 1)
+            if inner in places:
+                raise ConfigError(
+                    "the key is given twice", file=str(file), line=place.line, column=place.column,
+                    key=".".join(map(str, inner)), remedy="keep one of them",
+                )  # fmt: skip
+            places[inner] = place
+            _note_places(value, inner, places, file)
+    elif isinstance(node, yaml.SequenceNode):
+        for i, item in enumerate(node.value):
+            _note_places(item, (*location, i), places, file)
+
+
+def validate(
+    model: type[ModelT], data: Any, document: Document, location: Location = ()
+) -> tuple[ModelT | None, list[ConfigError]]:
+    """Check `data`, which stands at `location` of the document, against a model; all errors at once."""
+    if not isinstance(data, dict):
+        kind = "nothing" if data is None else type(data).__name__
+        return None, [document.error(f"a mapping of keys to values is needed here, not {kind}", location)]
+    try:
+        return model.model_validate_json(pydantic.TypeAdapter(Any).dump_json(data)), []
+    except pydantic.ValidationError as error:
+        return None, [_translate(detail, model, document, location) for detail in error.errors()]
+
+
+def raise_all(document: Document, errors: Sequence[ConfigError]) -> None:
+    """Raise what was found, if anything: one error as itself, several as one tree."""
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        raise ConfigErrors(f"{document.file} has {len(errors)} mistakes:", errors)
+
+
+def _translate(detail: Any, model: type[pydantic.BaseModel], document: Document, location: Location) -> ConfigError:
+    where: Location = (*location, *detail["loc"])
+    kind, value = detail["type"], detail.get("input")
+    if kind == "extra_forbidden":
+        known = _known_keys(model, detail["loc"][:-1])
+        close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known keys here: {', '.join(known)}"
+        return document.error("unknown key", where, remedy=hint)
+    if kind == "missing":
+        return document.error("required key is missing", where, remedy=f"add {detail['loc'][-1]!r}")
+    if kind in ("float_type", "int_type", "float_parsing", "int_parsing"):
+        number = "a whole number" if kind.startswith("int") else "a number"
+        return document.error(
+            f"{value!r} is not {number}", where, remedy="write the bare number; its unit is part of the key"
+        )
+    message = detail["msg"].removeprefix("Value error, ")
+    shown = f" (it is {value!r})" if isinstance(value, (str, int, float)) else ""
+    return document.error(f"{message}{shown}", where, remedy="correct the value")
+
+
+def _known_keys(model: type[pydantic.BaseModel], location: Sequence[str | int]) -> list[str]:
+    """The keys that the model allows at a location, followed through nested models."""
+    current: Any = model
+    for part in location:
+        field = current.model_fields.get(str(part))
+        inner = field.annotation if field is not None else None
+        if not (isinstance(inner, type) and issubclass(inner, pydantic.BaseModel)):
+            return []
+        current = inner
+    return list(current.model_fields)
