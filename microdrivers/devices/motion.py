@@ -17,7 +17,7 @@ MoveState = Literal["running", "done", "superseded", "cancelled", "failed"]
 
 WRONG_WAY_FRACTION = 0.2
 """An axis whose distance to its target grows by this share of the whole move (and by more than its tolerance)
-moves the wrong way."""
+moves the wrong way, once it is also more than full speed needs for braking."""
 
 
 class AxisSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -142,13 +142,16 @@ class Move(Generic[SampleT]):
 
     def _stop_if_wrong_way(self, position: Mapping[str, float]) -> None:
         for axis, goal in self.target.items():
+            spec = self._axes[axis]
             distance = abs(self._start[axis] - goal)
             excess = abs(position[axis] - goal) - distance
-            if excess > WRONG_WAY_FRACTION * distance + 10 * self._axes[axis].tolerance:
+            # A move that supersedes another may first have to brake from full speed.
+            braking = spec.max_speed**2 / spec.acceleration
+            if excess > WRONG_WAY_FRACTION * distance + braking + 10 * spec.tolerance:
                 self.state = "failed"
                 self._stop()
                 raise WrongDirection(
-                    f"axis {axis} moved away from its target by {excess:.3g} {self._axes[axis].unit}; stopped",
+                    f"axis {axis} moved away from its target by {excess:.3g} {spec.unit}; stopped",
                     device=self._device,
                     remedy=f"check the sign and the unit of axis {axis} in the rig file, and the encoder",
                 )

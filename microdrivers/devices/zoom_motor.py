@@ -115,6 +115,7 @@ class ZoomMotor(Device[ZoomSample]):
         self._check(zoom)
         latest = self.topic.latest if self.streaming else None
         start = latest if latest is not None else self.read()
+        self._publish_rest_until_now(start)
         return self._command(self.curve.steps_at(zoom), start.position_steps)
 
     def reference(self) -> None:
@@ -144,6 +145,16 @@ class ZoomMotor(Device[ZoomSample]):
                     "the motor's absolute position is not known",
                     remedy="make sure that the way is free, then reference()",
                 )
+
+    def _publish_rest_until_now(self, latest: ZoomSample) -> None:
+        """A motor that rested rests until it is commanded: samples before and after leave the instant open."""
+        if latest.moving:
+            return
+        self.topic.publish(
+            msgspec.structs.replace(
+                latest, t_ns=self.clock.now_ns(), dt_ns=0, t_source="computed", seq=self._next_seq(), order=-1
+            )
+        )
 
     def _command(self, target_steps: int, start_steps: int) -> Move[ZoomSample]:
         with self._naming_errors():

@@ -73,24 +73,29 @@ def read_document(file: Path) -> Document:
         raise ConfigError("there is no such file", file=str(file), remedy="check the path") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot be read: {error}", file=str(file), remedy="give a YAML text file") from error
+    try:
+        return _parse(file, text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = Place(mark.line + 1, mark.column + 1) if mark else Place(1, 1)
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ConfigError(
+            f"not valid YAML: {problem}",
+            file=str(file), line=place.line, column=place.column,
+            remedy="check indentation, colons and quotes around that place",
+        ) from error  # fmt: skip
+
+
+def _parse(file: Path, text: str) -> Document:
     loader = _CoreLoader(text)
     try:
         root = loader.get_single_node()
         places: dict[Location, Place] = {}
         if root is not None:
             _note_places(root, (), places, file)
-        data = loader.construct_document(root) if root is not None else None
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = Place(mark.line + 1, mark.column + 1) if mark else Place(1, 1)
-        raise ConfigError(
-            f"not valid YAML: {error.problem}",
-            file=str(file), line=place.line, column=place.column,
-            remedy="check indentation, colons and quotes around that place",
-        ) from error  # fmt: skip
+        return Document(file, loader.construct_document(root) if root is not None else None, places)
     finally:
         loader.dispose()
-    return Document(file, data, places)
 
 
 def _note_places(node: yaml.Node, location: Location, places: dict[Location, Place], file: Path) -> None:

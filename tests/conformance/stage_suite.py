@@ -1,0 +1,167 @@
+"""What every XYθ stage must do."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from microdrivers.core.errors import MoveCancelled, MoveSuperseded, NotReferenced, OutOfRange
+from microdrivers.core.samples import XYThetaSample
+from tests.conformance.bench import StageBench
+from tests.conformance.checks import Suite
+
+SUITE = Suite()
+
+
+def _truth(bench: StageBench) -> dict[str, float]:
+    now_ns = bench.clock.now_ns()
+    return {axis: bench.truth(axis, now_ns) for axis in ("x", "y", "theta")}
+
+
+@SUITE.check
+def moves_each_axis_its_own_way(bench: StageBench) -> None:
+    """Sign, axis and unit: +150 µm on x is +150 µm on x and nothing on y."""
+    start = _truth(bench)
+    bench.stage.move_to(x_um=7500.0 + 150.0)
+    assert _truth(bench)["x"] - start["x"] == pytest.approx(150.0, abs=0.5)
+    assert _truth(bench)["y"] - start["y"] == pytest.approx(0.0, abs=0.5)
+    bench.stage.move_to(y_um=7500.0 - 90.0)
+    assert _truth(bench)["y"] - start["y"] == pytest.approx(-90.0, abs=0.5)
+    bench.stage.move_to(theta_deg=0.25)
+    assert _truth(bench)["theta"] - start["theta"] == pytest.approx(0.25, abs=0.001)
+
+
+@SUITE.check
+def reads_where_it_is(bench: StageBench) -> None:
+    """A reading at rest agrees with the truth on all axes, sign and unit included."""
+    bench.stage.move_to(x_um=7612.3, y_um=7433.1, theta_deg=-0.5)
+    bench.clock.sleep(0.2)
+    pose = bench.stage.read()
+    assert pose.x_um == pytest.approx(bench.truth("x", pose.t_ns), abs=bench.noise_um)
+    assert pose.y_um == pytest.approx(bench.truth("y", pose.t_ns), abs=bench.noise_um)
+    assert pose.theta_deg == pytest.approx(bench.truth("theta", pose.t_ns), abs=3e-4)
+
+
+@SUITE.check
+def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
+    """In motion at 1 mm/s, the pose is that of its stamp within noise and the stated uncertainty of time."""
+    samples: list[XYThetaSample] = []
+    bench.stage.topic.subscribe(samples.append)
+    move = bench.stage.start_move_to(x_um=8200.0, speed_um_s=1000.0)
+    with bench.stage.stream(100.0):
+        bench.clock.sleep(0.5)
+    move.wait()
+    moving = [sample for sample in samples if sample.moving]
+    assert len(moving) > 30
+    for sample in moving:
+        allowed_um = bench.noise_um + 1000.0 * 2.5e-9 * sample.dt_ns
+        assert abs(sample.x_um - bench.truth("x", sample.t_ns)) <= allowed_um
+        assert sample.dt_ns <= 1_000_000
+
+
+@SUITE.check
+def refuses_what_is_out_of_range_and_moves_nothing(bench: StageBench) -> None:
+    start = _truth(bench)
+    for target in ({"x_um": 15_000.1}, {"y_um": -0.1}, {"theta_deg": 180.01}, {"x_um": 7600.0, "y_um": 1e6}):
+        with pytest.raises(OutOfRange):
+            bench.stage.start_move_to(**target)
+    bench.clock.sleep(0.3)
+    assert _truth(bench) == pytest.approx(start, abs=1e-6)
+
+
+@SUITE.check
+def refuses_what_is_not_finite(bench: StageBench) -> None:
+    start = _truth(bench)
+    for bad in (math.nan, math.inf, -math.inf):
+        with pytest.raises(OutOfRange):
+            bench.stage.start_move_to(x_um=bad)
+        with pytest.raises(OutOfRange):
+            bench.stage.start_move_to(x_um=7600.0, speed_um_s=bad)
+    bench.clock.sleep(0.3)
+    assert _truth(bench) == pytest.approx(start, abs=1e-6)
+
+
+@SUITE.check
+def refuses_too_high_a_speed(bench: StageBench) -> None:
+    with pytest.raises(OutOfRange):
+        bench.stage.start_move_to(x_um=7600.0, speed_um_s=1e5)
+
+
+@SUITE.check
+def is_on_target_only_when_it_is_there(bench: StageBench) -> None:
+    """No sample says "on target" before the table is within tolerance, and a finished move is at its target."""
+    tolerance_um = bench.stage.axes["x"].tolerance + bench.noise_um
+    samples: list[XYThetaSample] = []
+    bench.stage.topic.subscribe(samples.append)
+    for target in (8100.0, 8100.6, 7900.0):
+        bench.stage.move_to(x_um=target)
+        assert bench.truth("x", bench.clock.now_ns()) == pytest.approx(target, abs=tolerance_um)
+        for sample in samples:
+            if sample.on_target and sample.target_x_um == target:
+                assert bench.truth("x", sample.t_ns) == pytest.approx(target, abs=tolerance_um)
+
+
+@SUITE.check
+def a_stop_ends_the_motion_and_the_move(bench: StageBench) -> None:
+    move = bench.stage.start_move_to(x_um=12_000.0)
+    bench.clock.sleep(0.3)
+    bench.stage.stop()
+    bench.clock.sleep(0.3)
+    at_rest = _truth(bench)
+    bench.clock.sleep(0.3)
+    assert _truth(bench) == pytest.approx(at_rest, abs=0.01)
+    assert at_rest["x"] < 8500.0
+    with pytest.raises(MoveCancelled):
+        move.wait()
+    bench.stage.move_to(x_um=7600.0)
+    assert _truth(bench)["x"] == pytest.approx(7600.0, abs=0.5)
+
+
+@SUITE.check
+def a_newer_move_supersedes_the_older(bench: StageBench) -> None:
+    older = bench.stage.start_move_to(x_um=9000.0)
+    bench.clock.sleep(0.1)
+    bench.stage.move_to(x_um=7400.0)
+    with pytest.raises(MoveSuperseded):
+        older.wait()
+    assert _truth(bench)["x"] == pytest.approx(7400.0, abs=0.5)
+
+
+@SUITE.check
+def a_relative_move_counts_from_the_last_target(bench: StageBench) -> None:
+    bench.stage.move_to(x_um=7600.0)
+    for _ in range(5):
+        bench.stage.move_by(dx_um=10.0)
+    assert _truth(bench)["x"] == pytest.approx(7650.0, abs=0.3)
+
+
+@SUITE.check
+def x_and_y_arrive_together_at_the_path_speed(bench: StageBench) -> None:
+    bench.stage.start_move_to(x_um=7500.0 + 300.0, y_um=7500.0 - 400.0, speed_um_s=500.0)
+    bench.clock.sleep(0.6)
+    truth = _truth(bench)
+    dx_um, dy_um = truth["x"] - 7500.0, truth["y"] - 7500.0
+    assert math.hypot(dx_um, dy_um) == pytest.approx(500.0 * 0.6, rel=0.1)
+    assert dx_um / 300.0 == pytest.approx(-dy_um / 400.0, rel=0.05)
+
+
+@SUITE.check
+def an_unreferenced_axis_refuses_absolute_moves(bench: StageBench) -> None:
+    assert all(bench.stage.referenced.values())
+    _power_cycle(bench)
+    bench.stage.read()
+    assert not any(bench.stage.referenced.values())
+    start = _truth(bench)
+    with pytest.raises(NotReferenced):
+        bench.stage.start_move_to(x_um=7600.0)
+    bench.clock.sleep(0.2)
+    assert _truth(bench) == pytest.approx(start, abs=1e-6)
+
+
+def _power_cycle(bench: StageBench) -> None:
+    from microdrivers.fakes.wire import wire_named
+
+    wire = wire_named(bench.stage.name)
+    assert wire is not None
+    wire.emulator.power_cycle(bench.clock.now_ns())  # type: ignore[attr-defined]

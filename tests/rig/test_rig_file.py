@@ -1,0 +1,97 @@
+"""Rig files: every mistake is found, with its place and what to do."""
+
+import re
+
+import pytest
+
+from microdrivers.configs import shipped_rig
+from microdrivers.core.errors import ConfigError, ConfigErrors
+from microdrivers.rig import load_rig_file
+
+GOOD = shipped_rig().read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def edited(tmp_path):
+    """Write the shipped rig with one edit; returns the file and the line that was edited."""
+
+    def edit(old, new):
+        assert old in GOOD, old
+        file = tmp_path / "lab.yaml"
+        file.write_text(GOOD.replace(old, new, 1), encoding="utf-8")
+        return file, GOOD[: GOOD.index(old)].count("\n") + 1
+
+    return edit
+
+
+def test_the_shipped_rig_is_valid():
+    description = load_rig_file(shipped_rig())
+    assert list(description.devices) == ["sample_stage", "zoom", "camera_fine"]
+    assert description.as_data()["devices"]["zoom"]["backlash_steps"] == 20
+
+
+MISTAKES = {
+    "misspelt key": ("baudrate: 115200", "baudrat: 115200", "unknown key", "did you mean 'baudrate'"),
+    "wrong unit in the key": ("max_speed_um_s: 1500", "max_speed_mm_s: 1.5", "unknown key", "did you mean 'max_speed_um_s'"),
+    "unknown key at the top": ("name: workstation", "nmae: workstation", "unknown key", "did you mean 'name'"),
+    "unit in the value": ("tolerance_um: 0.15", "tolerance_um: 0.15 um", "is not a number", "unit is part of the key"),
+    "out of range": ("unit_id: 1", "unit_id: 40", "less than or equal to 31", "correct the value"),
+    "negative": ("acceleration_um_s2: 20000", "acceleration_um_s2: -1", "greater than 0", "correct the value"),
+    "not finite": ("pixel_pitch_um: 7.4", "pixel_pitch_um: .nan", "", ""),
+    "odd baud rate": ("baudrate: 115200", "baudrate: 115201", "115201", "correct the value"),
+    "missing driver": ("driver: oriental-az-zoom", "driver: oriental-azz", "no driver 'oriental-azz' is installed", "oriental-az-zoom"),
+    "role without device": ("sample_stage: sample_stage", "sample_stage: sample_stag", "there is no device", "sample_stage"),
+    "role of another kind": ("zoom: zoom", "zoom: camera_fine", "is a Camera, not a ZoomMotor", "another device"),
+    "key given twice": ("exposure_ms: 2.0", "rate_hz: 25", "given twice", "keep one"),
+    "tab": ("  zoom:\n", "\tzoom:\n", "not valid YAML", "indentation"),
+    "unknown target": ("kind: square", "kind: sqare", "square", ""),
+    "another schema": ("schema_version: 1", "schema_version: 2", "1", ""),
+    "exposure too long": ("exposure_ms: 2.0", "exposure_ms: 200.0", "does not fit rate_hz", ""),
+    "same axis twice": ('id: "2"', 'id: "1"', "different controller axis ids", ""),
+    "axis id without quotes": ('id: "2"', "id: 2", "string", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_with_its_place(edited, mistake):
+    old, new, what, remedy = MISTAKES[mistake]
+    file, line = edited(old, new)
+    with pytest.raises(ConfigError) as caught:
+        load_rig_file(file)
+    text = str(caught.value)
+    assert what in text
+    assert remedy in text
+    places = [int(place) for place in re.findall(rf"{re.escape(str(file))}:(\d+):\d+", text)]
+    nearby = {"exposure too long", "same axis twice", "unknown target"}  # stand for a whole section
+    assert places
+    assert line in places or mistake in nearby
+
+
+def test_all_mistakes_are_reported_at_once(tmp_path):
+    file = tmp_path / "lab.yaml"
+    file.write_text(
+        GOOD.replace("baudrate: 115200", "baud: 9600").replace("objective: 1.5", "objective: -1").replace("gain", "g"),
+        encoding="utf-8",
+    )
+    with pytest.raises(ConfigErrors) as caught:
+        load_rig_file(file)
+    assert len(caught.value.errors) >= 2
+    assert {error.line for error in caught.value.errors} != {1}
+
+
+@pytest.mark.parametrize("content", ["", "just text", "- a\n- b\n", "{}", "devices: {}\n", "\x00\x01"])
+def test_what_is_no_rig_file_is_refused(tmp_path, content):
+    file = tmp_path / "lab.yaml"
+    file.write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"lab\.yaml"):
+        load_rig_file(file)
+
+
+def test_a_missing_file_says_so(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        load_rig_file(tmp_path / "none.yaml")
+
+
+def test_numbers_are_yaml_1_2(edited):
+    file, _ = edited("resolution_um: 0.05", "resolution_um: 5e-2")
+    assert load_rig_file(file).devices["sample_stage"].settings.axes.x.resolution_um == 0.05
