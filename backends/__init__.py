@@ -1,0 +1,1 @@
+"""Real devices: lines own ports, protocols know languages, devices map them to the interfaces."""

@@ -145,7 +145,8 @@ class SerialLine:
         If an exchange is under way in another thread, that thread sends it as soon as its exchange ends.
         """
         self._posted.append(data)
-        self._flush_posted()
+        with self.clock.transaction():  # outside the lock: its end may dispatch others that use this line
+            self._flush_posted()
 
     # ------------------------------------------------------------------ inside
 
@@ -166,11 +167,10 @@ class SerialLine:
                 self._lock.release()
 
     def _send_posted(self, data: bytes) -> None:
-        with self.clock.transaction():
-            self.clock.sleep_until(self._free_at_ns)
-            self._write(data)
-            self._free_at_ns = self.clock.now_ns() + len(data) * self._byte_ns + self._gap_ns
-            self._suspect = True  # its reply, if any, must not be taken for the next one's
+        self.clock.sleep_until(self._free_at_ns)
+        self._write(data)
+        self._free_at_ns = self.clock.now_ns() + len(data) * self._byte_ns + self._gap_ns
+        self._suspect = True  # its reply, if any, must not be taken for the next one's
 
     def _prepare(self) -> None:
         self.clock.sleep_until(self._free_at_ns)

@@ -1,0 +1,246 @@
+"""The command language PI GCS 2.0 over a serial line: requests, replies, typed errors.
+
+Set commands have no reply, so each is followed by `ERR?` in the same write: one exchange, and the error
+number belongs to the command. A set command is never repeated. A query changes nothing and is repeated once
+if its reply did not come (not `ERR?`: reading it clears it). `MVR` is never used: a relative move whose reply
+is lost has no known end.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+from microdrivers.backends.lines.serial_line import Exchange, SerialLine
+from microdrivers.backends.pi_gcs import error_codes, replies
+from microdrivers.core.errors import LinkError, LinkTimeout, MoveCancelled, ProtocolError
+
+STATUS_REGISTER = "\x04"
+REQUEST_READY = "\x07"
+STOP_ALL = b"\x18"
+
+_READY = {"\xb1": True, "\xb0": False}
+_SINGLE_BYTE = (STATUS_REGISTER, REQUEST_READY)
+_POSITIONS = b"POS?\n"
+
+_UNINTELLIGIBLE_REMEDY = (
+    "check the baud rate (a wrong one gives garbage or silence), the cable, and that nothing else uses this line"
+)
+
+ResultT = TypeVar("ResultT")
+
+_log = logging.getLogger(__name__)
+
+
+class Pose(NamedTuple):
+    """Positions and status registers, asked for in one write.
+
+    `positions` are in the controller's units (mm, deg) by axis id, `status` is in the order of its axes. The
+    times are ns on the rig's clock: when the write began, when the last bit of `POS?` had left, and when the
+    first byte of the reply was seen.
+    """
+
+    positions: dict[str, float]
+    status: tuple[replies.AxisStatus, ...]
+    start_ns: int
+    asked_ns: int
+    first_byte_ns: int
+
+
+class Gcs:
+    """One GCS 2.0 controller at the end of a line, which it does not open or close.
+
+    Attributes:
+        identity: the answer to `*IDN?`, once `identify()` has been called.
+        interruptions: how many exchanges have failed; whoever sees it change should doubt what he knew.
+        stops: changes whenever a stop is sent.
+    """
+
+    def __init__(self, line: SerialLine) -> None:
+        self.identity = ""
+        self.interruptions = 0
+        self.stops = 0
+        self._line = line
+        self._stop_numbers = itertools.count(1)
+        self._error_pending = False
+        self._suspect = False
+
+    # ------------------------------------------------------------------ queries
+
+    def identify(self) -> str:
+        """The answer to `*IDN?`, which from now on tells this controller's replies from late ones.
+
+        Raises:
+            LinkTimeout, ProtocolError: silence, or garbage.
+        """
+        self.identity, self._suspect, self._error_pending = "", False, False
+        self.identity = self._query("*IDN?", replies.single)
+        return self.identity
+
+    def names(self, command: str) -> list[str]:
+        """A reply that lists one name a line, as `SAI?` does."""
+        return self._query(command, lambda reply: [line.strip() for line in reply])
+
+    def texts(self, command: str) -> dict[str, str]:
+        """A text for each axis, as `CST?` gives."""
+        return self._query(command, lambda reply: replies.assignments(reply, str))
+
+    def numbers(self, command: str) -> dict[str, float]:
+        """A number for each axis, in the controller's units."""
+        return self._query(command, lambda reply: replies.assignments(reply, replies.number))
+
+    def flags(self, command: str) -> dict[str, bool]:
+        """Yes or no for each axis."""
+        return self._query(command, lambda reply: replies.assignments(reply, replies.flag))
+
+    def status(self) -> tuple[replies.AxisStatus, ...]:
+        """The status registers of all axes (#4)."""
+        return self._query(STATUS_REGISTER, lambda reply: replies.status(replies.single(reply)))
+
+    def ready(self) -> bool:
+        """Whether the controller can take any command (#7); it cannot while it references."""
+        return self._query(REQUEST_READY, _ready)
+
+    def pose(self) -> Pose:
+        """Positions and status in one write, so that they belong together."""
+        return self._patiently(self._pose)
+
+    def error(self) -> int:
+        """The controller's last error number, which this clears. Never repeated."""
+        self._error_pending = False
+        return self._ask(b"ERR?\n", 1, _error_code)
+
+    # ------------------------------------------------------------------ commands
+
+    def command(self, *lines: str) -> None:
+        """Send set commands in one write and raise what the controller says about them.
+
+        Raises:
+            MicrodriversError: see `error_codes`. MoveCancelled: a stop was sent meanwhile.
+        """
+        code = self.attempt(*lines)
+        if code:
+            raise error_codes.error_from(code, sent=_text(*lines))
+
+    def attempt(self, *lines: str) -> int:
+        """As `command`, but return the error number (0 if none) of the last line that failed.
+
+        A stop that was sent earlier has left error 10 in the controller, and a failed exchange may have left
+        any other: it is read away in the same write, so that it is not taken for this command's.
+        """
+        stops, stale = self.stops, self._error_pending
+        self._error_pending = False
+        request = (b"ERR?\n" if stale else b"") + _text(*lines, "ERR?")
+        codes: list[int] = self._ask(request, 1 + stale, lambda *found: [_error_code(reply) for reply in found])
+        if stale and codes[0] not in (error_codes.NO_ERROR, error_codes.STOPPED):
+            _log.warning("an earlier error %d (%s) was pending", codes[0], error_codes.meaning_of(codes[0]))
+        if self.stops != stops:
+            raise MoveCancelled(
+                f"a stop was sent while {_text(*lines)!r} was under way",
+                remedy="check why the stop was requested, read the position, then command a new move",
+                moved="maybe",
+            )
+        return codes[-1]
+
+    def stop(self) -> None:
+        """Stop all axes abruptly (#24): from any thread, past an exchange under way, awaiting nothing."""
+        # Before and after: whoever begins or ends an exchange while this is sent must notice it.
+        self._note_stop()
+        try:
+            self._line.send_now(STOP_ALL)
+        finally:
+            self._note_stop()
+
+    # ------------------------------------------------------------------ inside
+
+    def _note_stop(self) -> None:
+        self.stops = next(self._stop_numbers)
+        self._error_pending = True
+
+    def _pose(self) -> Pose:
+        request = _POSITIONS + STATUS_REGISTER.encode()
+        exchange, (positions, status) = self._ask_timed(request, 2, _positions_and_status)
+        wire_ns = exchange.request_end_ns - exchange.request_start_ns
+        asked_ns = exchange.request_start_ns + wire_ns * len(_POSITIONS) // len(request)
+        return Pose(positions, status, exchange.request_start_ns, asked_ns, exchange.first_byte_ns)
+
+    def _query(self, command: str, parse: Callable[[replies.Reply], ResultT]) -> ResultT:
+        request = (command if command in _SINGLE_BYTE else f"{command}\n").encode("ascii")
+        return self._patiently(lambda: self._ask(request, 1, parse))
+
+    def _patiently(self, ask: Callable[[], ResultT]) -> ResultT:
+        """Ask; if no answer comes find out why, and if the controller does not know either, ask once more."""
+        try:
+            return ask()
+        except LinkTimeout as silence:
+            self._explain(silence)
+        return ask()
+
+    def _explain(self, silence: LinkTimeout) -> None:
+        """A refused query has no reply; its reason waits in ERR?."""
+        if not self.identity:
+            return
+        try:
+            code = self.error()
+        except LinkTimeout:
+            raise silence from None
+        if code not in (error_codes.NO_ERROR, error_codes.STOPPED):
+            raise error_codes.error_from(code) from silence
+
+    def _ask(self, request: bytes, count: int, parse: Callable[..., ResultT]) -> ResultT:
+        return self._ask_timed(request, count, parse)[1]
+
+    def _ask_timed(self, request: bytes, count: int, parse: Callable[..., ResultT]) -> tuple[Exchange, ResultT]:
+        """One exchange whose reply consists of `count` GCS replies, which `parse` is given."""
+        try:
+            if self._suspect:
+                self._resynchronise()
+            exchange = self._line.exchange(request, replies.completed_after(count))
+        except LinkError:
+            self._interrupted()
+            raise
+        try:
+            return exchange, parse(*replies.split_replies(exchange.reply, count))
+        except ProtocolError as error:
+            self._interrupted()
+            raise ProtocolError(
+                f"unintelligible reply: {error.what}",
+                sent=request, received=exchange.reply, remedy=_UNINTELLIGIBLE_REMEDY,
+            ) from None  # fmt: skip
+
+    def _resynchronise(self) -> None:
+        """Ask for the identity and read until it comes: what comes before it answers earlier requests."""
+        if self.identity:
+            last_line = self.identity.encode("latin-1") + b"\n"
+            self._line.exchange(b"*IDN?\n", lambda received: received.endswith(last_line))
+        self._suspect = False
+
+    def _interrupted(self) -> None:
+        self.interruptions += 1
+        self._suspect = self._error_pending = True
+
+
+def _ready(reply: replies.Reply) -> bool:
+    text = replies.single(reply)
+    if text not in _READY:
+        raise ProtocolError(f"ready or not ready was expected, not {text[:40]!r}")
+    return _READY[text]
+
+
+def _positions_and_status(
+    first: replies.Reply, second: replies.Reply
+) -> tuple[dict[str, float], tuple[replies.AxisStatus, ...]]:
+    # Controllers may serve a single byte at once, ahead of a line that is still being worked on.
+    if first[0].startswith("0x"):
+        first, second = second, first
+    return replies.assignments(first, replies.number), replies.status(replies.single(second))
+
+
+def _error_code(reply: replies.Reply) -> int:
+    return replies.integer(replies.single(reply))
+
+
+def _text(*lines: str) -> bytes:
+    return "".join(f"{line}\n" for line in lines).encode("ascii")
