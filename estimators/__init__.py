@@ -1,0 +1,1 @@
+"""Estimators: samples in, estimates out. No device, no thread, no clock, no file."""

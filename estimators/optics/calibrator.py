@@ -113,8 +113,9 @@ class OpticsCalibrator:
             vy_um_s=pose.velocity_y_um_s,
             sigma_time_s=math.hypot(point.dt_ns, pose.dt_ns) / (_HALF_WIDTH_95 * NS_PER_S),
         )
-        defined = recursion.frames_used >= 3
-        posterior_error = _distance(recursion.predict(pose.x_um, pose.y_um), point) if defined else math.nan
+        # Three measurements of one zoom are fitted exactly: only from the fourth on does a residual say anything.
+        overdetermined = self._clean_frames > 3
+        posterior_error = _distance(recursion.predict(pose.x_um, pose.y_um), point) if overdetermined else math.nan
         valid = self._clean_frames >= 3 and recursion.is_determined
         estimate = self._report(point, pose, zoom, moving, prior_error, posterior_error, valid)
         self._frame_index += 1

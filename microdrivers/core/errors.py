@@ -178,6 +178,10 @@ class WrongDirection(MotionError):
     """The axis moved away from its target."""
 
 
+class ReferenceLost(MotionError):
+    """The reference was lost while the axis moved."""
+
+
 class MoveSuperseded(MotionError):
     """A newer move replaced this one."""
 

@@ -79,6 +79,15 @@ class EstimatorHost:
 
     On a simulated clock the estimator runs as the samples arrive; in real time it has a thread of its own. Either
     way it sees the samples in `inbox.arrivals` order, so that feeding a recording in that order gives the same bits.
+
+    Args:
+        clock: decides between the two.
+        consumer: the estimator.
+        inputs: topics to listen to.
+        publish: takes the estimates.
+        capacity: of the inbox.
+        history: samples from before that the estimator sees first.
+        keep_samples: keep all samples in `recorded`, in the order of `inbox.arrivals`.
     """
 
     def __init__(
@@ -89,6 +98,7 @@ class EstimatorHost:
         publish: Callable[[Sample], object],
         *,
         capacity: int = 1024,
+        history: Iterable[Sample] = (),
         keep_samples: bool = False,
     ) -> None:
         self.inbox = Inbox(capacity=capacity)
@@ -97,6 +107,8 @@ class EstimatorHost:
         self._consumer = consumer
         self._publish = publish
         arrived = self._arrived_inline if clock.simulated else self.inbox.put
+        for sample in history:
+            self._arrived_inline(sample)
         self._subscriptions: list[Subscription] = [topic.subscribe(arrived) for topic in inputs]
         self._timer: Timer | None = None
         if not clock.simulated:

@@ -131,7 +131,7 @@ class OpticsEstimate(Sample, frozen=True, gc=False, kw_only=True):
         scale_px_per_um: M, the similarity fit's scale.
         angle_deg: in-plane angle, atan2(a21 − a12, a11 + a22).
         prediction_error_px: a priori, |y − φᵀ θ̂(t−1)|; NaN while undefined.
-        posterior_error_px: a posteriori, |y − φᵀ θ̂(t)|; NaN while undefined.
+        posterior_error_px: a posteriori, |y − φᵀ θ̂(t)|; NaN until more than three frames of one zoom are fitted.
         x_um, y_um: stage pose at mid-exposure. u_px, v_px: tracked point.
         zoom: zoom reading at mid-exposure; `zoom_moving` as the motor's own samples say.
         valid: three frames of one zoom lie behind the estimate and it is well-conditioned.

@@ -9,7 +9,7 @@ from typing import Generic, Literal
 import msgspec
 
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import MoveCancelled, MoveSuperseded, NotReached, WrongDirection
+from microdrivers.core.errors import MoveCancelled, MoveSuperseded, NotReached, ReferenceLost, WrongDirection
 from microdrivers.core.samples import SampleT
 from microdrivers.core.units import NS_PER_S, seconds_to_ns
 
@@ -58,6 +58,7 @@ class Move(Generic[SampleT]):
         read: Callable[[], SampleT],
         position_of: Callable[[SampleT], Mapping[str, float]],
         arrived: Callable[[SampleT], bool],
+        referenced: Callable[[SampleT], bool],
         stop: Callable[[], None],
         target: Mapping[str, float],
         start: Mapping[str, float],
@@ -73,6 +74,7 @@ class Move(Generic[SampleT]):
         self._read = read
         self._position_of = position_of
         self._arrived = arrived
+        self._referenced = referenced
         self._stop = stop
         self._start = dict(start)
         self._axes = axes
@@ -105,6 +107,7 @@ class Move(Generic[SampleT]):
         Raises:
             MoveSuperseded, MoveCancelled: it was replaced or stopped.
             WrongDirection: an axis moves away from its target; the device was stopped.
+            ReferenceLost: the device forgot its reference on the way, as after a power failure; it was stopped.
             NotReached: the deadline (or `timeout_s`) passed; the device was stopped.
         """
         limit_ns = self.deadline_t_ns
@@ -117,6 +120,7 @@ class Move(Generic[SampleT]):
             if self._arrived(sample) and not self._misses(position):
                 self.state = "done"
                 return sample
+            self._stop_if_reference_lost(sample)
             self._stop_if_wrong_way(position)
             if self._clock.now_ns() >= limit_ns:
                 self._fail_unreached(position, limit_ns)
@@ -139,6 +143,17 @@ class Move(Generic[SampleT]):
             for axis, goal in self.target.items()
             if not abs(position[axis] - goal) <= self._axes[axis].tolerance
         ]
+
+    def _stop_if_reference_lost(self, sample: SampleT) -> None:
+        if self._referenced(sample):
+            return
+        self.state = "failed"
+        self._stop()
+        raise ReferenceLost(
+            "the reference was lost during the move; stopped",
+            device=self._device,
+            remedy="check the controller's power, make sure that the way is free, then reference again",
+        )
 
     def _stop_if_wrong_way(self, position: Mapping[str, float]) -> None:
         for axis, goal in self.target.items():
@@ -166,3 +181,33 @@ class Move(Generic[SampleT]):
             device=self._device,
             remedy="check servo, load, obstacles and the speed in the rig file",
         )
+
+
+class MoveSlot(Generic[SampleT]):
+    """The one move that a device may have under way.
+
+    A stop may come from any thread, also between commanding a move and putting it here: it counts all the same.
+    """
+
+    def __init__(self) -> None:
+        self._current: Move[SampleT] | None = None
+        self._stops = 0
+
+    def supersede(self) -> int:
+        """A newer move is about to be commanded; returns what `hold` needs to know whether a stop came meanwhile."""
+        if self._current is not None:
+            self._current.supersede()
+        return self._stops
+
+    def hold(self, move: Move[SampleT], stops_before: int) -> Move[SampleT]:
+        """The newer move has been commanded."""
+        self._current = move
+        if self._stops != stops_before:
+            move.mark_stopped()
+        return move
+
+    def stopped(self) -> None:
+        """The device is being stopped."""
+        self._stops += 1
+        if self._current is not None:
+            self._current.mark_stopped()

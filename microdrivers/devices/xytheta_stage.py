@@ -6,11 +6,13 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
 from microdrivers.core.errors import NotReferenced, OutOfRange, StaleData
 from microdrivers.core.samples import XYThetaSample
 from microdrivers.core.units import Range, check_range, seconds_to_ns
 from microdrivers.devices.base import Device
-from microdrivers.devices.motion import AxisSpec, Move, move_duration_s
+from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, move_duration_s
 
 AXES = ("x", "y", "theta")
 MOVE_MARGIN_S = 0.5
@@ -29,6 +31,10 @@ class XYThetaStage(Device[XYThetaSample]):
 
     axes: Mapping[str, AxisSpec]
     settle_s: float = 0.1
+
+    def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
+        super().__init__(name, clock=clock, bus=bus)
+        self._move: MoveSlot[XYThetaSample] = MoveSlot()
 
     # ------------------------------------------------------------------ what a driver supplies
 
@@ -130,11 +136,9 @@ class XYThetaStage(Device[XYThetaSample]):
             self._check_targets(targets)
             start = position_of(self._recent_pose())
             speeds = self._axis_speeds(start, targets, speed_um_s, theta_speed_deg_s)
-            self._supersede()
+            stops_before = self._move.supersede()
             self._start_move(targets, speeds)
-        move = self._supervise(start, targets, speeds)
-        self._current_move = move
-        return move
+        return self._move.hold(self._supervise(start, targets, speeds), stops_before)
 
     def reference(self, axes: Sequence[str]) -> None:
         """Find the reference of the named axes, in exactly that order. Moves the stage to its switches.
@@ -146,20 +150,17 @@ class XYThetaStage(Device[XYThetaSample]):
             self._require_open()
             if not axes or len(set(axes)) != len(axes) or not set(axes) <= set(AXES):
                 raise OutOfRange(f"axes to reference: {', '.join(axes) or 'none'}", remedy="name x, y, theta once each")
-            self._supersede()
+            self._move.supersede()
             for axis in axes:
                 self._reference_axis(axis)
                 self._publish_event("reference_found", reason=f"axis {axis}")
 
     def stop(self, *, by: str = "user", reason: str = "") -> None:
         """Stop all axes now; a running `Move` ends as cancelled."""
-        if self._current_move is not None:
-            self._current_move.mark_stopped()
+        self._move.stopped()
         super().stop(by=by, reason=reason)
 
     # ------------------------------------------------------------------ checks and supervision
-
-    _current_move: Move[XYThetaSample] | None = None
 
     def _check_targets(self, targets: Mapping[str, float]) -> None:
         if not targets:
@@ -225,16 +226,13 @@ class XYThetaStage(Device[XYThetaSample]):
             read=self.read,
             position_of=position_of,
             arrived=lambda sample: sample.on_target and not sample.moving,
+            referenced=lambda _sample: all(self.referenced[axis] for axis in targets),
             stop=lambda: XYThetaStage.stop(self, by="supervision", reason="move failed or cancelled"),
             target=targets,
             start=start,
             axes=self.axes,
             deadline_t_ns=self.clock.now_ns() + seconds_to_ns(deadline_s),
         )
-
-    def _supersede(self) -> None:
-        if self._current_move is not None:
-            self._current_move.supersede()
 
 
 def position_of(pose: XYThetaSample) -> dict[str, float]:

@@ -11,11 +11,13 @@ from typing import Literal
 
 import msgspec
 
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
 from microdrivers.core.errors import NotReferenced, OutOfRange
 from microdrivers.core.samples import ZoomSample
 from microdrivers.core.units import Range, check_range, seconds_to_ns
 from microdrivers.devices.base import Device
-from microdrivers.devices.motion import AxisSpec, Move
+from microdrivers.devices.motion import AxisSpec, Move, MoveSlot
 
 Approach = Literal["below", "above", "direct"]
 """From which side a target is approached: `below` and `above` overshoot first where needed to take up backlash."""
@@ -48,10 +50,13 @@ class ZoomCurve(msgspec.Struct, frozen=True):
         return cls(steps, zoom)
 
     def zoom_at(self, position_steps: float) -> float:
-        """Zoom at a motor position; the end segments are continued beyond the table."""
+        """Zoom at a motor position; the end segments are continued beyond the table, to infinity at the very last."""
         i = min(max(bisect.bisect_right(self.steps, position_steps) - 1, 0), len(self.steps) - 2)
         share = (position_steps - self.steps[i]) / (self.steps[i + 1] - self.steps[i])
-        return float(self.zoom[i] * (self.zoom[i + 1] / self.zoom[i]) ** share)
+        try:
+            return float(self.zoom[i] * (self.zoom[i + 1] / self.zoom[i]) ** share)
+        except OverflowError:
+            return math.inf
 
     def steps_at(self, zoom: float) -> int:
         """Motor position of a zoom, rounded to the nearest step.
@@ -78,6 +83,10 @@ class ZoomMotor(Device[ZoomSample]):
     zoom_range: Range
     axis: AxisSpec
     settle_s: float = 0.1
+
+    def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
+        super().__init__(name, clock=clock, bus=bus)
+        self._move: MoveSlot[ZoomSample] = MoveSlot()
 
     @abstractmethod
     def _start_move(self, position_steps: int) -> None:
@@ -122,19 +131,18 @@ class ZoomMotor(Device[ZoomSample]):
         """Find the reference. Moves the motor."""
         with self._naming_errors():
             self._require_open()
-            self._supersede()
+            self._move.supersede()
             self._reference()
             self._publish_event("reference_found")
 
     def stop(self, *, by: str = "user", reason: str = "") -> None:
         """Stop the motor now; a running `Move` ends as cancelled."""
-        if self._current_move is not None:
-            self._current_move.mark_stopped()
+        self._move.stopped()
         super().stop(by=by, reason=reason)
 
     # ------------------------------------------------------------------ checks and supervision
 
-    _current_move: Move[ZoomSample] | None = None
+    _commanded_ns = -1
 
     def _check(self, zoom: float) -> None:
         with self._naming_errors():
@@ -148,7 +156,7 @@ class ZoomMotor(Device[ZoomSample]):
 
     def _publish_rest_until_now(self, latest: ZoomSample) -> None:
         """A motor that rested rests until it is commanded: samples before and after leave the instant open."""
-        if latest.moving:
+        if latest.moving or latest.t_ns <= self._commanded_ns:
             return
         self.topic.publish(
             msgspec.structs.replace(
@@ -158,8 +166,11 @@ class ZoomMotor(Device[ZoomSample]):
 
     def _command(self, target_steps: int, start_steps: int) -> Move[ZoomSample]:
         with self._naming_errors():
-            self._supersede()
-            self._start_move(target_steps)
+            stops_before = self._move.supersede()
+            try:
+                self._start_move(target_steps)
+            finally:
+                self._commanded_ns = self.clock.now_ns()
         travel_s = abs(target_steps - start_steps) / self.axis.max_speed
         ramps_s = 2.0 * self.axis.max_speed / self.axis.acceleration
         move = Move(
@@ -168,15 +179,11 @@ class ZoomMotor(Device[ZoomSample]):
             read=self.read,
             position_of=lambda sample: {"zoom": float(sample.position_steps)},
             arrived=lambda sample: sample.on_target and not sample.moving,
+            referenced=lambda _sample: self.referenced,
             stop=lambda: ZoomMotor.stop(self, by="supervision", reason="move failed or cancelled"),
             target={"zoom": float(target_steps)},
             start={"zoom": float(start_steps)},
             axes={"zoom": self.axis},
             deadline_t_ns=self.clock.now_ns() + seconds_to_ns(1.2 * (travel_s + ramps_s) + self.settle_s + 0.5),
         )
-        self._current_move = move
-        return move
-
-    def _supersede(self) -> None:
-        if self._current_move is not None:
-            self._current_move.supersede()
+        return self._move.hold(move, stops_before)
