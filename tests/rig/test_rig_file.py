@@ -32,15 +32,30 @@ def test_the_shipped_rig_is_valid():
 
 MISTAKES = {
     "misspelt key": ("baudrate: 115200", "baudrat: 115200", "unknown key", "did you mean 'baudrate'"),
-    "wrong unit in the key": ("max_speed_um_s: 1500", "max_speed_mm_s: 1.5", "unknown key", "did you mean 'max_speed_um_s'"),
+    "wrong unit in the key": (
+        "max_speed_um_s: 1500",
+        "max_speed_mm_s: 1.5",
+        "unknown key",
+        "did you mean 'max_speed_um_s'",
+    ),
     "unknown key at the top": ("name: workstation", "nmae: workstation", "unknown key", "did you mean 'name'"),
     "unit in the value": ("tolerance_um: 0.15", "tolerance_um: 0.15 um", "is not a number", "unit is part of the key"),
     "out of range": ("unit_id: 1", "unit_id: 40", "less than or equal to 31", "correct the value"),
     "negative": ("acceleration_um_s2: 20000", "acceleration_um_s2: -1", "greater than 0", "correct the value"),
     "not finite": ("pixel_pitch_um: 7.4", "pixel_pitch_um: .nan", "", ""),
     "odd baud rate": ("baudrate: 115200", "baudrate: 115201", "115201", "correct the value"),
-    "missing driver": ("driver: oriental-az-zoom", "driver: oriental-azz", "no driver 'oriental-azz' is installed", "oriental-az-zoom"),
-    "role without device": ("sample_stage: sample_stage", "sample_stage: sample_stag", "there is no device", "sample_stage"),
+    "missing driver": (
+        "driver: oriental-az-zoom",
+        "driver: oriental-azz",
+        "no driver 'oriental-azz' is installed",
+        "oriental-az-zoom",
+    ),
+    "role without device": (
+        "sample_stage: sample_stage",
+        "sample_stage: sample_stag",
+        "there is no device",
+        "sample_stage",
+    ),
     "role of another kind": ("zoom: zoom", "zoom: camera_fine", "is a Camera, not a ZoomMotor", "another device"),
     "key given twice": ("exposure_ms: 2.0", "rate_hz: 25", "given twice", "keep one"),
     "tab": ("  zoom:\n", "\tzoom:\n", "not valid YAML", "indentation"),
@@ -49,7 +64,7 @@ MISTAKES = {
     "exposure too long": ("exposure_ms: 2.0", "exposure_ms: 200.0", "does not fit rate_hz", ""),
     "same axis twice": ('id: "2"', 'id: "1"', "different controller axis ids", ""),
     "axis id without quotes": ('id: "2"', "id: 2", "string", ""),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

@@ -4,7 +4,7 @@ import pytest
 
 from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import SimulatedClock, SystemClock
-from microdrivers.core.errors import ConfigError, ConnectError, LinkLost, UnsupportedError
+from microdrivers.core.errors import ConfigError, ConnectError, ErrorTree, LinkLost, UnsupportedError
 from microdrivers.core.samples import DeviceEvent
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
@@ -51,12 +51,16 @@ def test_leaving_stops_everything_even_after_an_error():
     events = []
     rig = emulated()
     rig.bus.topic("sample_stage/event", DeviceEvent).subscribe(lambda event: events.append(event.kind))
-    with pytest.raises(RuntimeError, match="experiment"), rig:
+
+    def experiment():
         stage = rig.device("sample_stage", XYThetaStage)
         stage.reference(["x", "y", "theta"])
         stage.start_move_to(x_um=12_000)
         rig.clock.sleep(0.2)
         raise RuntimeError("experiment failed")
+
+    with pytest.raises(RuntimeError, match="experiment"), rig:
+        experiment()
     assert events[-2:] == ["stopped", "closed"]
     world = rig.simulation.world
     end_ns = world.stage_axes["x"].profile_end_ns
@@ -70,7 +74,7 @@ def test_stop_reaches_every_device_though_one_link_is_dead():
         rig.device("sample_stage", XYThetaStage).reference(["x", "y", "theta"])
         move = rig.device("zoom", ZoomMotor).start_move_to(zoom=10.0)
         wire_named("sample_stage").unplug()
-        with pytest.raises(Exception, match="not every device could be told to stop"):
+        with pytest.raises(ErrorTree, match="not every device could be told to stop"):
             rig.stop()
         assert move.state == "cancelled"
 

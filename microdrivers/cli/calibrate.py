@@ -1,0 +1,158 @@
+"""`microdrivers calibrate optics`."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.progress import TerminalProgress
+
+if TYPE_CHECKING:
+    from microdrivers.routines.optics.source import OpticsSource
+
+
+@click.command(short_help="Camera to stage, through a zoom change.")
+@click.option("--rig", "rig_file", type=click.Path(path_type=Path), help="Rig file; default: the emulated workstation.")
+@click.option("--fake", is_flag=True, help="Replace every connection of the rig file by its emulator.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
+@click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
+@click.option("--images", type=click.Path(path_type=Path), help="Folder with frames.csv: a recorded image sequence.")
+@click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-optics/.")
+@click.option("--radius-um", type=click.FloatRange(min=50), default=300.0, show_default=True, help="Circle's radius.")
+@click.option("--zoom-to", type=float, default=1.2, show_default=True, help="Zoom after the change.")
+@click.option("--zoom-from", type=float, default=0.9, show_default=True, help="Zoom before the change.")
+@click.option("--frames", type=click.IntRange(min=10), default=100, show_default=True, help="Frames on the circle.")
+@click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON instead of a summary.")
+def optics(
+    rig_file: Path | None,
+    fake: bool,
+    seed: int,
+    world: Path | None,
+    images: Path | None,
+    out: Path | None,
+    radius_um: float,
+    zoom_to: float,
+    zoom_from: float,
+    frames: int,
+    real_time: bool,
+    as_json: bool,
+) -> None:
+    r"""Calibrate camera to stage on line while the zoom changes (Bilen et al., section III.B).
+
+    A target on the sample stage moves on a circle; one of its points is tracked at frame rate and the projection
+    matrix is estimated by recursive least squares, through a change of zoom. Writes result.json, calibration.yaml
+    and report.html. On hardware the stage must have been referenced before: see `microdrivers reference`.
+
+    \b
+    Examples:
+      microdrivers calibrate optics                          emulated workstation, world 0
+      microdrivers calibrate optics --seed 7 --out runs/7    another world
+      microdrivers calibrate optics --rig lab.yaml           hardware
+      microdrivers calibrate optics --rig lab.yaml --fake    the same rig, emulated
+      microdrivers calibrate optics --images recording/      a recorded sequence
+    """
+    from microdrivers.core.errors import ConfigError
+
+    if images is not None and (rig_file is not None or fake or real_time):
+        raise ConfigError("--images replaces the rig", remedy="leave out --rig, --fake and --real-time")
+    progress = TerminalProgress(quiet=as_json)
+    try:
+        if images is not None:
+            complete = _from_images(images, out, as_json, progress)
+        else:
+            circle = {"radius_um": radius_um, "zoom_from": zoom_from, "zoom_to": zoom_to, "frames": frames}
+            complete = _on_rig(rig_file, fake, seed, world, out, circle, real_time, as_json, progress)
+    finally:
+        progress.close()
+    if not complete:
+        click.echo("interrupted: all axes were told to stop; what had been measured was kept", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _from_images(folder: Path, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+    from microdrivers.recording.image_sequence import ImageSequence
+    from microdrivers.routines.optics import SequencePlayback
+
+    sequence = ImageSequence(folder)
+    provenance = {"source": f"image sequence {folder}", "clock": "recorded"}
+    return _run(SequencePlayback(sequence), provenance, out, as_json, progress)
+
+
+def _on_rig(
+    rig_file: Path | None,
+    fake: bool,
+    seed: int,
+    world: Path | None,
+    out: Path | None,
+    circle: dict[str, Any],
+    real_time: bool,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> bool:
+    from microdrivers.configs import shipped_rig
+    from microdrivers.core.clock import SimulatedClock, SystemClock
+    from microdrivers.rig import open_rig
+    from microdrivers.routines.optics import CircleExperiment, CircleSettings
+
+    fake = fake or rig_file is None
+    clock = SimulatedClock() if fake and not real_time else SystemClock()
+    with open_rig(rig_file or shipped_rig(), fake=fake, seed=seed, clock=clock, world=world) as rig:
+        settings = CircleSettings(**circle)
+        provenance = {
+            "source": "live rig" if not fake else "emulated rig",
+            "clock": "simulated" if clock.simulated else "system",
+            "rig_name": rig.file.name,
+            "rig_file": str(rig.description.file),
+            "rig": rig.description.as_data(),
+            "fake": fake,
+            "seed": seed if fake else None,
+            "devices": {name: _info(device) for name, device in rig.devices.items()},
+            "settings": dict(settings._asdict()),
+        }
+        return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress)
+
+
+def _info(device: Any) -> dict[str, str]:
+    import msgspec
+
+    return {key: str(value) for key, value in msgspec.structs.asdict(device.info).items()}
+
+
+def _run(
+    source: OpticsSource, known: dict[str, Any], out: Path | None, as_json: bool, progress: TerminalProgress
+) -> bool:
+    from microdrivers.core.clock import utc_now
+    from microdrivers.report.optics_report import write_optics_report
+    from microdrivers.report.summary import optics_summary
+    from microdrivers.report.truth import OpticsTruthCollector
+    from microdrivers.routines.optics import calibrate_optics
+    from microdrivers.routines.optics.calibration import build_result
+    from microdrivers.routines.provenance import describe_run
+
+    truth = OpticsTruthCollector(source.bus)
+    run = calibrate_optics(source, progress=progress)
+    if not run.estimates and not run.complete:
+        return False
+    known["settings"] = known.get("settings", {}) | run.settings._asdict()
+    command = shlex.join(["microdrivers", *sys.argv[1:]])
+    result = build_result(run, describe_run(known, command=command, now=utc_now()))
+    result = result.model_copy(update={"truth": truth.compare(result, run.estimates)})
+    folder = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics"
+    folder.mkdir(parents=True, exist_ok=True)
+    result.write_json(folder / "result.json")
+    result.write_calibration(folder / "calibration.yaml")
+    progress.step("drawing the report")
+    write_optics_report(result, folder / "report.html")
+    progress.close()
+    if as_json:
+        click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
+    else:
+        click.echo(optics_summary(result))
+        click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html")
+    return run.complete

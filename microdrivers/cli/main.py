@@ -1,0 +1,94 @@
+"""`microdrivers`: the commands, and how errors reach the user. Imports nothing heavy, so that --help is instant."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from types import FrameType
+from typing import Any
+
+import click
+
+from microdrivers import __version__
+
+EXIT_ERROR = 1
+EXIT_INTERRUPTED = 130
+
+
+class CommandLine(click.Group):
+    """Turns errors raised on purpose into one clear message; a traceback only with --debug."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        from microdrivers.core.errors import MicrodriversError
+
+        try:
+            return super().invoke(ctx)
+        except MicrodriversError as error:
+            if ctx.params.get("debug"):
+                raise
+            click.secho("error: ", fg="red", bold=True, nl=False, err=True)
+            click.echo(str(error), err=True)
+            ctx.exit(EXIT_ERROR)
+        except KeyboardInterrupt:
+            click.echo("\ninterrupted: all axes were told to stop", err=True)
+            ctx.exit(EXIT_INTERRUPTED)
+
+
+@click.group(cls=CommandLine, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, "-V", "--version")
+@click.option("--debug", is_flag=True, help="Show tracebacks and debug messages.")
+def main(debug: bool) -> None:
+    r"""Run, check and calibrate a micromanipulation rig described in one YAML file.
+
+    \b
+    Examples:
+      microdrivers calibrate optics                      the paper's experiment on an emulated workstation
+      microdrivers calibrate optics --rig lab.yaml --fake
+      microdrivers calibrate optics --images DIR         from a recorded image sequence
+      microdrivers check lab.yaml                        validate a rig file without hardware
+      microdrivers reference lab.yaml --axes x,y         find the reference of a stage (moves!)
+    """
+    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
+    signal.signal(signal.SIGTERM, _interrupt)
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    """Being terminated is to stop the stages just as Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def _add(group: click.Group, name: str, module: str, attribute: str, short_help: str) -> None:
+    """Add a command whose module is imported only when it is called or its help is asked for."""
+    group.add_command(_LazyCommand(name, module, attribute, short_help))
+
+
+class _LazyCommand(click.Command):
+    def __init__(self, name: str, module: str, attribute: str, short_help: str) -> None:
+        super().__init__(name, short_help=short_help)
+        self._module = module
+        self._attribute = attribute
+
+    def _real(self) -> click.Command:
+        import importlib
+
+        command: click.Command = getattr(importlib.import_module(self._module), self._attribute)
+        return command
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        return self._real().make_context(info_name, args, parent, **extra)
+
+    def get_short_help_str(self, limit: int = 45) -> str:  # noqa: ARG002 - click's signature
+        return self.short_help or ""
+
+
+@main.group()
+def calibrate() -> None:
+    """Calibrate a part of the rig and write result, calibration and report."""
+
+
+_add(calibrate, "optics", "microdrivers.cli.calibrate", "optics", "Camera to stage, through a zoom change.")
+_add(main, "check", "microdrivers.cli.check", "check", "Validate a rig file without touching hardware.")
+_add(main, "reference", "microdrivers.cli.reference", "reference", "Find the reference of a stage's axes (moves!).")

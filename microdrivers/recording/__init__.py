@@ -1,0 +1,1 @@
+"""Recorded data as a source of samples."""

@@ -1,0 +1,1 @@
+"""Routines: move devices, feed estimators, write results."""

@@ -1,0 +1,255 @@
+"""The calibration itself: the same for a live rig, a simulation and a recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from microdrivers.core.errors import IllConditioned
+from microdrivers.core.inbox import EstimatorHost
+from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
+from microdrivers.core.units import NS_PER_S
+from microdrivers.estimators.optics import OpticalParameters, optical_parameters
+from microdrivers.estimators.optics.calibrator import CalibratorSettings, OpticsCalibrator, PointTracker
+from microdrivers.results.optics import (
+    OpticsResult,
+    Provenance,
+    Tilt,
+    Trace,
+    Traces,
+    Truth,
+    ValidFor,
+    ZoomChange,
+    iterations_to_settle,
+)
+from microdrivers.routines.optics.source import Optics, OpticsSource
+from microdrivers.routines.progress import Progress, SilentProgress
+
+LARGEST_SCALE_UNCERTAINTY = 0.05
+"""A calibration whose scale is known no better than this (95 %, relative) is refused."""
+
+
+class OpticsRun(NamedTuple):
+    """What a run left behind.
+
+    Attributes:
+        complete: False if it was interrupted.
+        estimates: one a matched frame.
+        arrivals: bus-wide order numbers in the order in which the estimator saw the samples.
+        recorded: those samples, if asked for.
+    """
+
+    complete: bool
+    estimates: list[OpticsEstimate]
+    lost_frames: int
+    unmatched_frames: int
+    settings: CalibratorSettings
+    optics: Optics
+    arrivals: list[int]
+    recorded: list[Sample]
+
+
+def calibrate_optics(
+    source: OpticsSource,
+    *,
+    settings: CalibratorSettings | None = None,
+    progress: Progress | None = None,
+    keep_samples: bool = False,
+) -> OpticsRun:
+    """Let a source publish and estimate P from what it publishes, on line.
+
+    An interruption (Ctrl-C) ends the source, which stops what moves, and keeps what was measured.
+
+    Raises:
+        MicrodriversError: whatever the source raises.
+    """
+    settings = settings or CalibratorSettings()
+    bus, names = source.bus, source.names
+    track = bus.topic(f"{names.camera}/track", TrackedPoint)
+    estimated = bus.topic("estimate/optics", OpticsEstimate)
+    estimates: list[OpticsEstimate] = []
+    subscription = estimated.subscribe(estimates.append)
+    hosts: list[EstimatorHost] = []
+    calibrators: list[OpticsCalibrator] = []
+
+    def publish(result: Sample) -> None:
+        if isinstance(result, OpticsEstimate):
+            estimated.publish(result)
+        elif isinstance(result, TrackedPoint):
+            track.publish(result)
+
+    def begin(tracker: PointTracker) -> None:
+        calibrators.append(OpticsCalibrator(tracker, settings))
+        stage, zoom = bus.topic(names.stage, XYThetaSample), bus.topic(names.zoom, ZoomSample)
+        # The first frame was exposed before now: it needs the poses and zoom readings from before.
+        history = sorted((*stage.history, *zoom.history), key=lambda sample: sample.order)
+        hosts.append(
+            EstimatorHost(
+                source.clock,
+                calibrators[-1],
+                (stage, zoom, bus.topic(names.camera, Frame)),
+                publish,
+                history=history,
+                keep_samples=keep_samples,
+            )
+        )
+
+    complete = True
+    try:
+        source.run(begin, progress or SilentProgress())
+    except KeyboardInterrupt:
+        complete = False
+    finally:
+        for host in hosts:
+            host.close()
+        subscription.cancel()
+    return OpticsRun(
+        complete=complete,
+        estimates=estimates,
+        lost_frames=sum(calibrator.lost_frames for calibrator in calibrators),
+        unmatched_frames=sum(calibrator.unmatched_frames for calibrator in calibrators),
+        settings=settings,
+        optics=source.optics(),
+        arrivals=[order for host in hosts for order in host.inbox.arrivals],
+        recorded=[sample for host in hosts for sample in host.recorded],
+    )
+
+
+def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = None) -> OpticsResult:
+    """Turn a run into its result.
+
+    Raises:
+        IllConditioned: the run does not determine a calibration; the message says what was missing.
+    """
+    final = _final_estimate(run)
+    covariance = np.array(final.covariance).reshape(6, 6)
+    parameters = optical_parameters(
+        final.projection,
+        covariance,
+        degrees_of_freedom=final.degrees_of_freedom,
+        pixel_pitch_um=run.optics.pixel_pitch_um,
+    )
+    _check_determined(parameters, run)
+    p = final.projection
+    pitch_um = run.optics.pixel_pitch_um
+    scales = _trace([e.scale_px_per_um for e in run.estimates])
+    return OpticsResult(
+        complete=run.complete,
+        projection=(p[:3], p[3:]),
+        scale_px_per_um=parameters.scale_px_per_um,
+        scale_sigma_px_per_um=parameters.sigma_scale_px_per_um or 0.0,
+        zoom=final.zoom,
+        magnification=parameters.magnification,
+        angle_deg=parameters.angle_deg,
+        angle_sigma_deg=parameters.sigma_angle_deg or 0.0,
+        tilt=Tilt(
+            interval_deg=parameters.tilt_deg_interval,
+            label=parameters.tilt_label,
+            sign_ambiguous=parameters.tilt_sign_ambiguous,
+        ),
+        view=parameters.view,
+        translation_um=parameters.translation_um,
+        covariance=covariance.tolist(),
+        degrees_of_freedom=final.degrees_of_freedom,
+        prediction_error_px=_trace([e.prediction_error_px for e in run.estimates]),
+        posterior_error_px=_trace([e.posterior_error_px for e in run.estimates]),
+        magnification_trace=[None if s is None or pitch_um is None else s * pitch_um for s in scales],
+        zoom_change=zoom_change(run.estimates),
+        frames=len(run.estimates),
+        lost_frames=run.lost_frames,
+        unmatched_frames=run.unmatched_frames,
+        valid_for=ValidFor(
+            camera=run.optics.camera,
+            binning=run.optics.binning,
+            roi=run.optics.roi,
+            objective=run.optics.objective,
+            zoom=final.zoom,
+        ),
+        traces=_traces(run.estimates, scales),
+        notes=_notes(run),
+        provenance=provenance,
+        truth=truth,
+    )
+
+
+def zoom_change(estimates: Sequence[OpticsEstimate]) -> ZoomChange | None:
+    """How the last zoom change of a run settled; None if the zoom rested throughout."""
+    moving = [index for index, estimate in enumerate(estimates) if estimate.zoom_moving]
+    if not moving:
+        return None
+    last = first = moving[-1]
+    while first > 0 and estimates[first - 1].zoom_moving:
+        first -= 1
+    prior = _trace([estimate.prediction_error_px for estimate in estimates])
+    posterior = _trace([estimate.posterior_error_px for estimate in estimates])
+    return ZoomChange(
+        first_frame=first,
+        last_moving_frame=last,
+        zoom_before=estimates[max(first - 1, 0)].zoom,
+        zoom_after=estimates[-1].zoom,
+        iterations_to_0p1_px=iterations_to_settle(prior, first_frame=first),
+        iterations_to_0p1_px_from_end=iterations_to_settle(prior, first_frame=last + 1),
+        posterior_iterations_to_0p1_px=iterations_to_settle(posterior, first_frame=first),
+        posterior_iterations_to_0p1_px_from_end=iterations_to_settle(posterior, first_frame=last + 1),
+    )
+
+
+def _final_estimate(run: OpticsRun) -> OpticsEstimate:
+    for estimate in reversed(run.estimates):
+        if estimate.valid and estimate.covariance:
+            return estimate
+    raise IllConditioned(
+        f"{len(run.estimates)} frames with a pose do not determine a calibration "
+        f"({run.lost_frames} frames without the target, {run.unmatched_frames} without a pose)",
+        remedy="let the stage move along both of its axes while the zoom rests, with the target in view",
+    )
+
+
+def _check_determined(parameters: OpticalParameters, run: OpticsRun) -> None:
+    sigma = parameters.sigma_scale_px_per_um
+    relative = math.inf if sigma is None else 1.96 * sigma / parameters.scale_px_per_um
+    if not relative <= LARGEST_SCALE_UNCERTAINTY:
+        x_um = [estimate.x_um for estimate in run.estimates]
+        y_um = [estimate.y_um for estimate in run.estimates]
+        raise IllConditioned(
+            f"the scale would be uncertain by {100 * relative:.0f} %: the stage moved over only "
+            f"{max(x_um) - min(x_um):.3g} × {max(y_um) - min(y_um):.3g} µm",
+            remedy="move further, and along both axes: a circle that fills the view is best",
+        )
+
+
+def _trace(values: Sequence[float]) -> Trace:
+    return [value if math.isfinite(value) else None for value in values]
+
+
+def _traces(estimates: Sequence[OpticsEstimate], scales: Trace) -> Traces:
+    start_ns = estimates[0].t_ns
+    return Traces(
+        frame=[e.frame_index for e in estimates],
+        time_s=[(e.t_ns - start_ns) / NS_PER_S for e in estimates],
+        x_um=[e.x_um for e in estimates],
+        y_um=[e.y_um for e in estimates],
+        u_px=[e.u_px for e in estimates],
+        v_px=[e.v_px for e in estimates],
+        zoom=[e.zoom for e in estimates],
+        zoom_moving=[e.zoom_moving for e in estimates],
+        projection=[e.projection if math.isfinite(e.scale_px_per_um) else None for e in estimates],
+        scale_px_per_um=scales,
+        angle_deg=_trace([e.angle_deg for e in estimates]),
+    )
+
+
+def _notes(run: OpticsRun) -> list[str]:
+    notes = []
+    if not run.complete:
+        notes.append("The run was interrupted; the result holds what had been measured until then.")
+    if run.lost_frames:
+        notes.append(f"The target was not found in {run.lost_frames} frames.")
+    if run.unmatched_frames:
+        notes.append(f"{run.unmatched_frames} frames had no pose close enough before and after them.")
+    if run.optics.pixel_pitch_um is None:
+        notes.append("The pixel pitch is not known, so no magnification is given; the scale is complete without it.")
+    return notes

@@ -1,0 +1,45 @@
+"""A recorded image sequence as a source of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock, SimulatedClock
+from microdrivers.estimators.optics.calibrator import PointTracker
+from microdrivers.recording.image_sequence import ImageSequence
+from microdrivers.routines.optics.source import Optics, SourceNames
+from microdrivers.routines.optics.targets import TargetKind, make_tracker
+from microdrivers.routines.progress import Progress
+
+
+class SequencePlayback:
+    """Publishes an image sequence; its target is natural texture unless stated otherwise."""
+
+    def __init__(self, sequence: ImageSequence, *, target: TargetKind = "texture") -> None:
+        self.bus = Bus()
+        self.clock: Clock = SimulatedClock()
+        self.names = SourceNames("stage", "zoom", "camera")
+        self._sequence = sequence
+        self._target: TargetKind = target
+
+    def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
+        """Publish the whole sequence."""
+        progress.step(f"playing {len(self._sequence)} frames of {self._sequence.folder}")
+        begin(make_tracker(self._target))
+        self._sequence.publish(self.bus, stage="stage", zoom="zoom", camera="camera")
+
+    def optics(self) -> Optics:
+        """A sequence tells the image's size and nothing else."""
+        height, width = self._sequence.load(self._sequence.rows[0]).shape
+        return Optics(
+            camera=self._sequence.folder.name,
+            binning=1,
+            roi=(0, 0, width, height),
+            objective=None,
+            pixel_pitch_um=None,
+        )
+
+    def frames_expected(self) -> int:
+        """Rows of the sequence."""
+        return len(self._sequence)

@@ -1,0 +1,50 @@
+"""What the calibration needs of whoever publishes the samples: a live experiment, a recording, a test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
+from microdrivers.estimators.optics.calibrator import PointTracker
+from microdrivers.routines.progress import Progress
+
+
+class SourceNames(NamedTuple):
+    """Topics of the three streams."""
+
+    stage: str
+    zoom: str
+    camera: str
+
+
+class Optics(NamedTuple):
+    """What is known of the optics beforehand; None where it is not."""
+
+    camera: str
+    binning: int
+    roi: tuple[int, int, int, int]
+    objective: float | None
+    pixel_pitch_um: float | None
+
+
+class OpticsSource(Protocol):
+    """Publishes poses, zoom readings and frames of a moving target."""
+
+    bus: Bus
+    clock: Clock
+    names: SourceNames
+
+    def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
+        """Publish the samples.
+
+        Calls `begin` with a tracker for the target once what follows is meant for the calibration. On any way out,
+        an interruption included, nothing moves any more.
+        """
+
+    def optics(self) -> Optics:
+        """What is known of the optics, valid after `run`."""
+
+    def frames_expected(self) -> int:
+        """How many frames the calibration will get, for progress."""

@@ -1,0 +1,89 @@
+"""Ctrl-C and cut cables: whatever happens, the stage stands still afterwards, and the emulator's log proves it."""
+
+from contextlib import suppress
+
+import pytest
+
+from microdrivers.core.errors import IllConditioned, LinkError
+from microdrivers.fakes.wire import Wire, wire_named
+
+
+def stage_state(rig, emulator):
+    """Where the axes are, and whether a stop arrived."""
+    later_ns = rig.clock.now_ns() + 10**9
+    axes = rig.simulation.world.stage_axes.values()
+    speeds = [abs(axis.speed_at(later_ns)) for axis in axes]
+    return speeds, [text for _, text in emulator.events if "stop" in text]
+
+
+class InterruptAt:
+    """Progress that is interrupted at a frame."""
+
+    def __init__(self, frame):
+        self._frame = frame
+
+    def step(self, text):
+        pass
+
+    def count(self, done, total):
+        if done >= self._frame:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("frame", [20, 46, 80])
+def test_ctrl_c_on_the_circle_stops_all_axes_and_keeps_what_was_measured(calibrate, frame):
+    emulators = []
+    calibration = calibrate(
+        progress=InterruptAt(frame), prepare=lambda rig: emulators.append(wire_named("sample_stage").emulator)
+    )
+    speeds, stops = stage_state(calibration.rig, emulators[0])
+    assert speeds == pytest.approx([0, 0, 0], abs=1e-9)
+    assert stops
+    assert not calibration.result.complete
+    assert frame - 3 <= calibration.result.frames <= frame + 1
+    assert any("interrupted" in note for note in calibration.result.notes)
+
+
+@pytest.mark.parametrize("write", [40, 90, 150, 230, 333, 480, 620])
+def test_ctrl_c_in_the_middle_of_an_exchange_stops_all_axes(calibrate, monkeypatch, write):
+    """At any request on any line: while referencing, finding the target, streaming, changing the zoom."""
+    written, seen = [0], {}
+    honest = Wire.write
+
+    def interrupting(wire, data):
+        honest(wire, data)
+        written[0] += 1
+        if written[0] == write:
+            raise KeyboardInterrupt
+
+    def prepare(rig):
+        seen["rig"], seen["emulator"] = rig, wire_named("sample_stage").emulator
+
+    monkeypatch.setattr(Wire, "write", interrupting)
+    with suppress(KeyboardInterrupt, IllConditioned):  # perhaps too little was measured for a result
+        calibrate(prepare=prepare)
+    assert written[0] > write
+    speeds, stops = stage_state(seen["rig"], seen["emulator"])
+    assert speeds == pytest.approx([0, 0, 0], abs=1e-9)
+    assert stops
+
+
+def test_a_cut_camera_cable_ends_the_run_with_a_typed_error_and_stops_the_stage(calibrate, monkeypatch):
+    from microdrivers.fakes.camera.source import FakeFrameSource
+
+    honest, delivered, seen = FakeFrameSource._deliver, [0], {}
+
+    def failing(source, *arguments):
+        delivered[0] += 1
+        source.connected = delivered[0] < 30
+        honest(source, *arguments)
+
+    def prepare(rig):
+        seen["rig"], seen["emulator"] = rig, wire_named("sample_stage").emulator
+
+    monkeypatch.setattr(FakeFrameSource, "_deliver", failing)
+    with pytest.raises(LinkError, match="camera_fine"):
+        calibrate(prepare=prepare)
+    speeds, stops = stage_state(seen["rig"], seen["emulator"])
+    assert speeds == pytest.approx([0, 0, 0], abs=1e-9)
+    assert stops
