@@ -91,9 +91,8 @@ def main() -> int:
     for value in sorted(set(iterations.tolist())):
         print(f"  {value:>5g}: {int(np.sum(iterations == value))}")
     share = np.sum(iterations <= 8) / len(outcomes)
-    print(
-        f"  ≤ 8 in {100 * share:.1f} % of all worlds; zoom moving over {sorted({o['moving_frames'] for o in good})} frames"
-    )
+    moving = sorted({outcome["moving_frames"] for outcome in good})
+    print(f"  ≤ 8 in {100 * share:.1f} % of all worlds; zoom moving over {moving} frames")
     for key, unit in (("scale_percent", "%"), ("angle_deg", "°")):
         errors = np.abs([o[key] for o in good])
         print(f"|{key}| 40 frames later: median {np.median(errors):.4f} {unit}, 95 of 100 within "

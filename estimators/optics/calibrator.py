@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Protocol, cast
 
+from microdrivers.core.errors import IllConditioned
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
 from microdrivers.core.synchroniser import PoseAt, Synchroniser, interpolate_pose
 from microdrivers.core.units import NS_PER_S
@@ -49,14 +50,22 @@ class OpticsCalibrator:
     A frame waits until a pose and a zoom sample lie on either side of its mid-exposure; the pose is interpolated
     there. "The forgetting factor is automatically increased once the magnification motor turns": λ = 0 while the
     motor's own samples say that it moves, and for `flush_frames` after.
+
+    Args:
+        tracker: finds the point in each frame.
+        settings: how to forget.
+        frames: how many frames to take; later ones are ignored. None takes all.
     """
 
-    def __init__(self, tracker: PointTracker, settings: CalibratorSettings | None = None) -> None:
+    def __init__(
+        self, tracker: PointTracker, settings: CalibratorSettings | None = None, *, frames: int | None = None
+    ) -> None:
         self.settings = settings or CalibratorSettings()
         self.recursion: ProjectionRecursion | None = None
         self.lost_frames = 0
         self.skipped_frames = 0
         self._tracker = tracker
+        self._frames_left = math.inf if frames is None else frames
         self._synchroniser: Synchroniser[TrackedPoint] = Synchroniser(("stage", "zoom"))
         self._frame_index = 0
         self._clean_frames = 0
@@ -79,7 +88,8 @@ class OpticsCalibrator:
             self._synchroniser.add_reference("stage", sample)
         elif isinstance(sample, ZoomSample):
             self._synchroniser.add_reference("zoom", sample)
-        elif isinstance(sample, Frame):
+        elif isinstance(sample, Frame) and self._frames_left > 0:
+            self._frames_left -= 1
             point = self._tracker.update(sample)
             results.append(point)
             if point.found:
@@ -161,7 +171,7 @@ class OpticsCalibrator:
     ) -> OpticsEstimate:
         assert self.recursion is not None
         uncertainty = self.recursion.uncertainty() if valid else None
-        parameters = self._parameters() if self.recursion.is_determined else None
+        parameters = self._parameters()
         return OpticsEstimate(
             t_ns=point.t_ns,
             dt_ns=point.dt_ns,
@@ -185,9 +195,15 @@ class OpticsCalibrator:
             valid=valid,
         )
 
-    def _parameters(self) -> OpticalParameters:
+    def _parameters(self) -> OpticalParameters | None:
+        """What the present P says of the optics; None while it says nothing."""
         assert self.recursion is not None
-        return optical_parameters(self.recursion.projection)
+        if not self.recursion.is_determined:
+            return None
+        try:
+            return optical_parameters(self.recursion.projection)
+        except IllConditioned:
+            return None
 
 
 def _distance(predicted: tuple[float, float], point: TrackedPoint) -> float:

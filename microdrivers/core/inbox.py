@@ -106,6 +106,7 @@ class EstimatorHost:
         self._keep_samples = keep_samples
         self._consumer = consumer
         self._publish = publish
+        self._failure: Exception | None = None
         arrived = self._arrived_inline if clock.simulated else self.inbox.put
         for sample in history:
             self._arrived_inline(sample)
@@ -119,17 +120,29 @@ class EstimatorHost:
         while (sample := self.inbox.take()) is not None:
             if self._keep_samples:
                 self.recorded.append(sample)
-            for estimate in self._consumer.update(sample):
+            try:
+                estimates = self._consumer.update(sample)
+            except Exception as error:
+                self._failure = error
+                raise
+            for estimate in estimates:
                 self._publish(estimate)
 
     def close(self) -> None:
-        """Consume what is left and stop listening."""
+        """Consume what is left and stop listening.
+
+        Raises:
+            Exception: what the estimator raised, if it failed; the bus alone would have contained it.
+        """
         for subscription in self._subscriptions:
             subscription.cancel()
         if self._timer is not None:
             self._timer.cancel()
-        self.work()
+        if self._failure is None:
+            self.work()
         self.inbox.close()
+        if self._failure is not None:
+            raise self._failure
 
     def _arrived_inline(self, sample: Sample) -> None:
         self.inbox.put(sample)

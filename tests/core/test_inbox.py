@@ -104,8 +104,22 @@ def test_a_failing_estimator_in_a_thread_is_not_silent():
     failed_by_ns = clock.now_ns() + 2_000_000_000
     with pytest.raises(ArithmeticError, match="singular"):
         _sleep_in_pieces(clock, failed_by_ns)
-    host.close()
+    with pytest.raises(ArithmeticError, match="singular"):
+        host.close()
     clock.close()
+
+
+def test_a_failing_estimator_on_a_simulated_clock_is_raised_when_its_host_closes():
+    class Broken:
+        def update(self, sample):
+            raise ArithmeticError("singular")
+
+    topic = Bus().topic("a", DeviceEvent)
+    host = EstimatorHost(SimulatedClock(), Broken(), [topic], lambda estimate: None)
+    topic.publish(event(0))
+    topic.publish(event(1))
+    with pytest.raises(ArithmeticError, match="singular"):
+        host.close()
 
 
 def _sleep_in_pieces(clock, until_ns):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def sequence(tmp_path):
 
 
 def edit_cell(folder, line, column, value):
-    rows = list(csv.reader((folder / "frames.csv").open()))
+    rows = list(csv.reader((folder / "frames.csv").read_text().splitlines()))
     rows[line - 1][rows[0].index(column)] = value
     (folder / "frames.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
 
@@ -54,7 +55,8 @@ def test_real_micrographs_calibrate_to_their_stated_projection(tmp_path):
     assert result["truth"] is None
     assert result["magnification"] is None
     assert result["zoom_change"] is None
-    assert "nan" not in (tmp_path / "out" / "report.html").read_text().lower().replace("nano", "")
+    page = re.sub(r"<(style|svg).*?</\1>|<[^>]*>", " ", (tmp_path / "out" / "report.html").read_text(), flags=re.DOTALL)
+    assert not re.search(r"\b(nan|none|inf)\b", page.lower())
 
 
 def test_comments_and_further_columns_are_allowed(sequence):
@@ -121,7 +123,7 @@ def test_no_motion_is_said(sequence, tmp_path):
         edit_cell(sequence, number + 2, "y_um", f"{0.05 * (number % 3)}")
     ran = calibrate(sequence, tmp_path / "out")
     assert ran.exit_code == 1
-    assert "to do: move further, and along both axes" in ran.output or "let the stage move" in ran.output
+    assert re.search(r"to do: .*both (of its )?axes", ran.output)
 
 
 def test_a_folder_without_a_table_is_refused(tmp_path):

@@ -135,7 +135,7 @@ def replayed(calibration, spoil=lambda point: point, settings=None):
     """Feed the recorded samples to a new estimator whose tracker is spoilt."""
     first = calibration.run.estimates[0]
     tracker = Broken(make_tracker("square", near_px=(first.u_px, first.v_px)), spoil)
-    estimator = OpticsCalibrator(tracker, settings)
+    estimator = OpticsCalibrator(tracker, settings, frames=len(calibration.run.estimates))
     estimates = []
     for sample in calibration.run.recorded:
         estimates += [estimate for estimate in estimator.update(sample) if hasattr(estimate, "projection")]

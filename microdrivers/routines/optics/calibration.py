@@ -82,7 +82,7 @@ def calibrate_optics(
             track.publish(result)
 
     def begin(tracker: PointTracker) -> None:
-        calibrators.append(OpticsCalibrator(tracker, settings))
+        calibrators.append(OpticsCalibrator(tracker, settings, frames=source.frames_expected()))
         stage, zoom = bus.topic(names.stage, XYThetaSample), bus.topic(names.zoom, ZoomSample)
         # The first frame was exposed before now: it needs the poses and zoom readings from before.
         history = sorted((*stage.history, *zoom.history), key=lambda sample: sample.order)

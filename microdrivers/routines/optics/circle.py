@@ -18,6 +18,7 @@ from microdrivers.core.errors import (
     NotReferenced,
     OutOfRange,
     TargetLost,
+    UnsupportedError,
 )
 from microdrivers.core.samples import Frame, TrackedPoint
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
@@ -77,10 +78,15 @@ class CircleExperiment:
                 file=str(rig.description.file),
                 remedy="add a microscope section: sample_stage, zoom, camera, objective, target",
             )
+        self.settings = settings or CircleSettings()
+        if section.target.kind == "texture" and self.settings.zoom_to != self.settings.zoom_from:
+            raise UnsupportedError(
+                "texture is tracked against a fixed template, which no longer fits once the zoom has changed",
+                remedy="use a square target, or calibrate at one zoom: --zoom-from Z --zoom-to Z",
+            )
         self.bus = rig.bus
         self.clock = rig.clock
         self.names = SourceNames(section.sample_stage, section.zoom, section.camera)
-        self.settings = settings or CircleSettings()
         self._rig = rig
         self._section = section
         self._stage = rig.device(section.sample_stage, XYThetaStage)
