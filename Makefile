@@ -41,7 +41,7 @@ format: $(READY)
 # Needs uv (pip install uv); the lock names no index.
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header \
-	  --no-annotate --upgrade --group dev pyproject.toml -o requirements.lock
+	  --no-annotate --upgrade --extra can --group dev pyproject.toml -o requirements.lock
 
 bench: $(READY)
 	$(BIN)/python scripts/bench_rls.py

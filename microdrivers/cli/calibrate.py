@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option("--images", type=click.Path(path_type=Path), help="Folder with frames.csv: a recorded image sequence.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-optics/.")
-@click.option("--radius-um", type=click.FloatRange(min=50), default=300.0, show_default=True, help="Circle's radius.")
+@click.option("--radius-um", type=float, help="Radius of the circle; default: up to 300, as large as fits the view.")
 @click.option("--zoom-to", type=float, default=1.2, show_default=True, help="Zoom after the change.")
 @click.option("--zoom-from", type=float, default=0.9, show_default=True, help="Zoom before the change.")
 @click.option("--frames", type=click.IntRange(min=10), default=100, show_default=True, help="Frames on the circle.")
@@ -36,7 +36,7 @@ def optics(
     world: Path | None,
     images: Path | None,
     out: Path | None,
-    radius_um: float,
+    radius_um: float | None,
     zoom_to: float,
     zoom_from: float,
     frames: int,
@@ -71,7 +71,7 @@ def optics(
     finally:
         progress.close()
     if not complete:
-        click.echo("interrupted: all axes were told to stop; what had been measured was kept", err=True)
+        click.echo("interrupted: all axes were told to stop", err=True)
         sys.exit(EXIT_INTERRUPTED)
 
 
@@ -138,6 +138,7 @@ def _run(
     truth = OpticsTruthCollector(source.bus)
     run = calibrate_optics(source, progress=progress)
     if not run.estimates and not run.complete:
+        click.echo("nothing had been measured yet", err=True)
         return False
     known["settings"] = known.get("settings", {}) | run.settings._asdict()
     command = shlex.join(["microdrivers", *sys.argv[1:]])

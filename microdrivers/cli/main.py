@@ -31,7 +31,7 @@ class CommandLine(click.Group):
             click.echo(str(error), err=True)
             ctx.exit(EXIT_ERROR)
         except KeyboardInterrupt:
-            click.echo("\ninterrupted: all axes were told to stop", err=True)
+            click.echo("\ninterrupted; whatever was open has been told to stop and was closed", err=True)
             ctx.exit(EXIT_INTERRUPTED)
 
 
@@ -50,6 +50,8 @@ def main(debug: bool) -> None:
       microdrivers reference lab.yaml --axes x,y         find the reference of a stage (moves!)
     """
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
+    # Also where a shell has started us with SIGINT ignored: whoever drives stages must be stoppable.
+    signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _interrupt)
 
 

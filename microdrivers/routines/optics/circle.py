@@ -21,7 +21,7 @@ from microdrivers.core.errors import (
     UnsupportedError,
 )
 from microdrivers.core.samples import Frame, TrackedPoint
-from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
+from microdrivers.core.units import NS_PER_MS, NS_PER_S, Range, check_range, seconds_to_ns
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
@@ -44,6 +44,8 @@ _LEAD_IN_FRAMES = 6
 _OLDEST_POSE_S = 0.1
 _SILENCE_NS = NS_PER_S
 _SMALLEST_RADIUS_UM = 50.0
+_LARGEST_RADIUS_UM = 10_000.0
+_PAPER_RADIUS_UM = 300.0
 _SCALE_TRUST = 2.0
 """The observed scale may differ from objective × zoom by this factor before units are suspected."""
 
@@ -51,11 +53,11 @@ _SCALE_TRUST = 2.0
 class CircleSettings(NamedTuple):
     """The experiment's figures; defaults are the paper's.
 
-    `radius_um` is made smaller if the circle does not fit the view. `change_after_frame` is 0-based: the zoom is
-    commanded once that frame has been exposed.
+    `radius_um` None means the paper's 300 µm, or as much of it as fits the view; a stated radius must fit.
+    `change_after_frame` is 0-based: the zoom is commanded once that frame has been exposed.
     """
 
-    radius_um: float = 300.0
+    radius_um: float | None = None
     degrees_per_frame: float = 4.0
     zoom_from: float = 0.9
     zoom_to: float = 1.2
@@ -93,6 +95,15 @@ class CircleExperiment:
         self._zoom = rig.device(section.zoom, ZoomMotor)
         self._camera = rig.device(section.camera, Camera)
         self._reach_px = 0.0
+        self._check_settings()
+
+    def _check_settings(self) -> None:
+        asked = self.settings
+        if asked.radius_um is not None:
+            what = "radius of the circle"
+            check_range(asked.radius_um, Range(_SMALLEST_RADIUS_UM, _LARGEST_RADIUS_UM), what=what, unit="µm")
+        for name, zoom in (("zoom before the change", asked.zoom_from), ("zoom after the change", asked.zoom_to)):
+            check_range(zoom, self._zoom.zoom_range, what=name, unit="x", device=self._zoom.name)
 
     def optics(self) -> Optics:
         """The rig's optics with the camera's present settings."""
@@ -209,15 +220,17 @@ class CircleExperiment:
             x_um - limits["x"].min, limits["x"].max - x_um, y_um - limits["y"].min, limits["y"].max - y_um
         )
         in_speed_um = self._fastest_um_s() / self._angular_speed()
-        radius_um = min(self.settings.radius_um, in_view_um, in_travel_um, in_speed_um)
-        if radius_um < _SMALLEST_RADIUS_UM:
+        fits_um = min(in_view_um, in_travel_um, in_speed_um)
+        asked_um = self.settings.radius_um
+        needed_um = _SMALLEST_RADIUS_UM if asked_um is None else asked_um
+        if fits_um < needed_um:
             raise OutOfRange(
-                f"only a circle of {max(radius_um, 0.0):.0f} µm fits (view {in_view_um:.0f} µm, travel "
-                f"{in_travel_um:.0f} µm, speed {in_speed_um:.0f} µm); {_SMALLEST_RADIUS_UM:.0f} µm are needed",
-                remedy="use a smaller target or a lower zoom, bring the target nearer to the middle of the travel, "
-                "or take a larger radius",
+                f"only a circle of {max(fits_um, 0.0):.0f} µm fits (view {max(in_view_um, 0.0):.0f} µm, travel "
+                f"{in_travel_um:.0f} µm, speed {in_speed_um:.0f} µm); {needed_um:.0f} µm are needed",
+                remedy="use a smaller radius, a smaller target or a lower zoom, or bring the target nearer to the "
+                "middle of the travel",
             )
-        return (x_um, y_um), radius_um
+        return (x_um, y_um), min(_PAPER_RADIUS_UM, fits_um) if asked_um is None else asked_um
 
     def _angular_speed(self) -> float:
         return math.radians(self.settings.degrees_per_frame) * self._camera.settings.rate_hz

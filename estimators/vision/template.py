@@ -1,0 +1,199 @@
+"""A fixed piece of texture: where it lies in another image, by correlation, then least squares to sub-pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Float32Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
+
+MIN_HALF_PX = 12
+"""Half the side of the smallest window that can be tracked."""
+
+MARGIN_PX = 3
+"""Pixels around the window that interpolation needs."""
+
+_TAPS = 6
+_COARSE_ROWS = 240
+_MAX_REDUCTION = 8
+_MAX_ITERATIONS = 30
+_CONVERGED_PX = 1e-4
+_MAX_REFINEMENT_PX = 2.5
+_SMOOTHING_PX = 1.5
+_STRUCTURE_RATIO = 3.0
+_ROUNDING_VARIANCE = 1.0 / 12.0
+
+
+class Match(NamedTuple):
+    """The template found in an image.
+
+    Attributes:
+        shift: displacement (u, v) of the texture since the template was taken, px.
+        sigma_px: standard deviation of the shift per axis, predicted from the residuals.
+        correlation: correlation coefficient of the template with the image at the shift, after fitting gain, bias.
+        deformation: largest change of length or angle across the window: 0.01 is 1 % or 0.6°.
+        deformation_sigma: standard deviation of one element of the deformation.
+    """
+
+    shift: FloatArray
+    sigma_px: float
+    correlation: float
+    deformation: float
+    deformation_sigma: float
+
+
+class Template:
+    """The texture in a window of one image, which never changes afterwards.
+
+    Least squares in the inverse-compositional form: the image, sampled at the current shift, is projected on the
+    template, its two derivatives and a constant; that projection is computed once. Four more columns, linear in
+    the place, tell a change of scale, angle or shape from noise.
+
+    Args:
+        image: grey levels, rows × columns.
+        centre: (column, row) of the window's centre.
+        half: half-sizes (columns, rows) of the window: it spans 2·half + 1 pixels, stays `MARGIN_PX` inside
+            the image and must have structure, see `has_structure`.
+    """
+
+    def __init__(self, image: Float32Array, *, centre: tuple[int, int], half: tuple[int, int]) -> None:
+        (u, v), (a, b) = centre, half
+        self._centre = np.array([u, v], dtype=np.float64)
+        self._half = np.array([a, b])
+        self._size = (2 * a + 1, 2 * b + 1)
+        framed = image[v - b - 1 : v + b + 2, u - a - 1 : u + a + 2].astype(np.float64)
+        patch = framed[1:-1, 1:-1]
+        by_u = 0.5 * (framed[1:-1, 2:] - framed[1:-1, :-2])
+        by_v = 0.5 * (framed[2:, 1:-1] - framed[:-2, 1:-1])
+        self._level = float(patch.mean())
+        self._chip_half = np.array([a // 2, b // 2])
+        self._chip = _window(image, self._centre.astype(int), self._chip_half)
+        self._reduction = int(min(_MAX_REDUCTION, max(1, min(image.shape) // _COARSE_ROWS)))
+        self._coarse_chip = _reduced(self._chip, self._reduction)
+
+        y, x = np.mgrid[-b : b + 1, -a : a + 1].astype(np.float64)
+        columns = [by_u, by_v, patch - self._level, np.ones_like(patch), x * by_u, y * by_u, x * by_v, y * by_v]
+        rows = np.stack([column.ravel() for column in columns])
+        normal = rows @ rows.T
+        self._rows = rows[:4]
+        self._inverse_normal = np.linalg.inv(normal[:4, :4])
+        self._projection = self._inverse_normal @ self._rows
+        full_inverse = np.linalg.inv(normal)[4:]
+        self._deformation = full_inverse @ rows
+        self._deformation_spread = math.sqrt(float(np.diag(full_inverse[:, 4:]).max()))
+
+    def search(self, image: Float32Array) -> tuple[FloatArray, float]:
+        """Whole-pixel shift at which the middle of the template correlates best with `image`, and how well."""
+        f = self._reduction
+        if f == 1:
+            place, peak = _best_place(image, self._chip)
+        else:
+            coarse, _ = _best_place(_reduced(image, f), self._coarse_chip)
+            low = np.maximum(coarse * f - f - 1, 0)
+            high = coarse * f + np.array(self._chip.shape[::-1]) + f + 1
+            region = image[low[1] : high[1], low[0] : high[0]]
+            place, peak = _best_place(region, self._chip)
+            place = place + low
+        return place + self._chip_half - self._centre, peak
+
+    def fits_in(self, shape: tuple[int, ...], shift: FloatArray) -> bool:
+        """Whether the window, moved by `shift`, lies `MARGIN_PX` inside an image of `shape` (rows, columns)."""
+        middle = self._centre + shift
+        upper = np.array([shape[1] - 1.0, shape[0] - 1.0]) - MARGIN_PX
+        return bool(np.all(middle - self._half >= MARGIN_PX) and np.all(middle + self._half <= upper))
+
+    def refine(self, image: Float32Array, shift: FloatArray) -> Match | None:
+        """Fit shift, gain and bias from the whole-pixel `shift` on; None if the fit runs away or leaves the image."""
+        start = shift
+        for _ in range(_MAX_ITERATIONS):
+            sampled = self._sample(image, shift)
+            fitted = _product(self._projection, sampled)
+            if not fitted[2] > 0.0:
+                return None
+            step = fitted[:2] / fitted[2]
+            shift = shift - step
+            if not np.abs(shift - start).max() < _MAX_REFINEMENT_PX or not self.fits_in(image.shape, shift):
+                return None
+            if np.abs(step).max() < _CONVERGED_PX:
+                return self._judge(sampled, fitted, shift)
+        return None
+
+    def _sample(self, image: Float32Array, shift: FloatArray) -> FloatArray:
+        """The image in the shifted window, interpolated, minus the template's mean level."""
+        corner = self._centre - self._half + shift
+        whole = np.floor(corner).astype(int)
+        part_u, part_v = (corner - whole).tolist()
+        u, v = (whole - _TAPS // 2 + 1).tolist()
+        width, height = self._size
+        surrounded = image[v : v + height + _TAPS - 1, u : u + width + _TAPS - 1]
+        filtered = cv2.sepFilter2D(surrounded, -1, _interpolator(part_u), _interpolator(part_v), anchor=(0, 0))
+        return filtered[:height, :width].astype(np.float64).ravel() - self._level
+
+    def _judge(self, sampled: FloatArray, fitted: FloatArray, shift: FloatArray) -> Match:
+        residuals = sampled - np.einsum("i,ij->j", fitted, self._rows)
+        squares = float((residuals * residuals).sum())
+        correlation = math.sqrt(max(0.0, 1.0 - squares / (len(residuals) * float(sampled.var()))))
+        gain = float(fitted[2])
+        variance = max(squares / (len(residuals) - 4), _ROUNDING_VARIANCE) / gain**2
+        affine = _product(self._deformation, sampled) / gain
+        return Match(
+            shift=shift,
+            sigma_px=math.sqrt(0.5 * variance * float(np.trace(self._inverse_normal[:2, :2]))),
+            correlation=correlation,
+            deformation=float(np.linalg.norm(affine.reshape(2, 2), ord=2)),
+            deformation_sigma=math.sqrt(variance) * self._deformation_spread,
+        )
+
+
+def _product(rows: FloatArray, vector: FloatArray) -> FloatArray:
+    """`rows` @ `vector` without BLAS, whose threads get in the way of OpenCV's and cost ten times the product."""
+    return np.asarray(np.einsum("ij,j->i", rows, vector))
+
+
+def _interpolator(part: float) -> FloatArray:
+    """Six-tap Lagrange interpolation at `part` (0 … 1) between the third and fourth tap.
+
+    Exact for polynomials up to the fifth degree. Two taps (bilinear) pull fine texture towards whole pixels by
+    up to 0.01 px.
+    """
+    nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
+    differences = nodes[:, None] - nodes[None, :] + np.eye(_TAPS)
+    factors = (part - nodes[None, :]) / differences
+    np.fill_diagonal(factors, 1.0)
+    return np.asarray(factors.prod(axis=1))
+
+
+def _window(image: Float32Array, centre: npt.NDArray[np.int_], half: npt.NDArray[np.int_]) -> Float32Array:
+    (u, v), (a, b) = centre.tolist(), half.tolist()
+    return np.ascontiguousarray(image[v - b : v + b + 1, u - a : u + a + 1])
+
+
+def _reduced(image: Float32Array, factor: int) -> Float32Array:
+    """Means over `factor` × `factor` pixels, on a grid that begins at the top-left pixel."""
+    rows, columns = image.shape[0] // factor, image.shape[1] // factor
+    whole = image[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _best_place(image: Float32Array, chip: Float32Array) -> tuple[npt.NDArray[np.int_], float]:
+    """Top-left place (column, row) of `chip` in `image` with the largest correlation coefficient."""
+    scores = cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED)
+    scores[~np.isfinite(scores)] = -1.0
+    _, peak, _, place = cv2.minMaxLoc(scores)
+    return np.array(place), float(peak)
+
+
+def has_structure(image: Float32Array, *, centre: tuple[int, int], half: tuple[int, int]) -> bool:
+    """Whether the window varies along both axes by more than white noise does after smoothing."""
+    (u, v), (a, b) = centre, half
+    patch = image[v - b : v + b + 1, u - a : u + a + 1].astype(np.float64)
+    smooth = cv2.GaussianBlur(patch, (0, 0), _SMOOTHING_PX)
+    noise_variance = float(np.var(patch - smooth)) + _ROUNDING_VARIANCE
+    by_v, by_u = np.gradient(smooth)
+    weakest = float(np.linalg.eigvalsh(np.cov(by_u.ravel(), by_v.ravel()))[0])
+    return weakest > _STRUCTURE_RATIO * noise_variance / (8.0 * math.pi * _SMOOTHING_PX**4)
