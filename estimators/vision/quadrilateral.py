@@ -58,11 +58,13 @@ def find_quadrilaterals(image: GreyImage, *, min_side_px: float) -> Detection:
         min_side_px: smaller squares are ignored.
     """
     rows, columns = image.shape
+    if min(rows, columns) < min_side_px:
+        return Detection([], partly_in_view=False)
     reduction = int(min(_MAX_REDUCTION, max(1, min(rows, columns) // _COARSE_ROWS)))
     size = (max(1, columns // reduction), max(1, rows // reduction))
     pitch = np.array([columns / size[0], rows / size[1]])
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if reduction > 1 else image
-    flat = _flatten(cv2.GaussianBlur(coarse.astype(np.float32), (5, 5), 1.0))
+    flat = _flatten(cv2.GaussianBlur(coarse, (5, 5), 1.0))
 
     min_side = min_side_px / float(pitch.mean())
 
@@ -139,7 +141,7 @@ def _flatten(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
         (image.shape[1], image.shape[0]),
         interpolation=cv2.INTER_LINEAR,
     )
-    return np.asarray(image - background, dtype=np.float32)
+    return np.asarray(cv2.subtract(image, background, dtype=cv2.CV_32F), dtype=np.float32)
 
 
 def _median(values: FloatArray) -> float:
@@ -149,14 +151,15 @@ def _median(values: FloatArray) -> float:
 
 def _foreground(flat: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Mask (0, 1) of what stands out on the side of zero where Otsu's threshold falls."""
-    low, high = float(flat.min()), float(flat.max())
+    low, high, _, _ = cv2.minMaxLoc(flat)
     if high - low < 1e-3:
         return np.zeros(flat.shape, dtype=np.uint8)
-    scaled = ((flat - low) * np.float32(255.0 / (high - low))).astype(np.uint8)
-    level, _ = cv2.threshold(scaled, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    threshold = low + (level + 0.5) * (high - low) / 255.0
-    mask = flat > threshold if threshold > 0 else flat < threshold
-    return mask.astype(np.uint8)
+    scale = 255.0 / (high - low)
+    scaled = cv2.convertScaleAbs(flat, alpha=scale, beta=-low * scale)
+    level, mask = cv2.threshold(scaled, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    if low + (level + 0.5) / scale < 0:
+        mask = cv2.bitwise_xor(mask, np.ones_like(mask))
+    return np.asarray(mask, dtype=np.uint8)
 
 
 def _large_blobs(mask: npt.NDArray[np.uint8], *, min_side: float) -> list[_Blob]:

@@ -181,7 +181,11 @@ def _reduced(image: Float32Array, factor: int) -> Float32Array:
 
 
 def _best_place(image: Float32Array, chip: Float32Array) -> tuple[npt.NDArray[np.int_], float]:
-    """Top-left place (column, row) of `chip` in `image` with the largest correlation coefficient."""
+    """Top-left place (column, row) of `chip` in `image` with the largest correlation coefficient, which
+    is −1 where the image is too small.
+    """
+    if image.shape[0] < chip.shape[0] or image.shape[1] < chip.shape[1]:
+        return np.zeros(2, dtype=int), -1.0
     scores = cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED)
     scores[~np.isfinite(scores)] = -1.0
     _, peak, _, place = cv2.minMaxLoc(scores)

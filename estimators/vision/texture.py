@@ -113,7 +113,8 @@ class TextureTracker:
         return self._reporter.found(frame, position_px=(u, v), sigma_px=match.sigma_px)
 
     def _lose_sight(self, frame: Frame, correlation: float) -> TrackedPoint:
-        detail = f"the best correlation with the template is {correlation:.2f}"
+        best = f"the best correlation with the template is {correlation:.2f}"
+        detail = f"{best}: the texture left the view, or zoom, focus or angle changed; reset() takes a new template"
         return self._lose(frame, "out_of_view" if self._leaving else "appearance_changed", detail)
 
     def _lose(self, frame: Frame, flag: str, detail: str) -> TrackedPoint:

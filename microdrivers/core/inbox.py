@@ -13,8 +13,6 @@ from microdrivers.core.samples import Sample
 
 OverflowPolicy = Literal["block", "drop_oldest"]
 
-_IDLE_POLL_S = 0.001
-
 
 class Consumer(Protocol):
     """An estimator as a host sees it: samples in, estimates out."""
@@ -55,9 +53,11 @@ class Inbox:
             self.arrivals.append(sample.order)
             self._changed.notify_all()
 
-    def take(self) -> Sample | None:
-        """The oldest waiting sample, or None if there is none."""
+    def take(self, *, wait: bool = False) -> Sample | None:
+        """The oldest waiting sample; None if there is none, or with `wait` once the inbox is closed and empty."""
         with self._changed:
+            while wait and not self._waiting and not self._closed:
+                self._changed.wait()
             if not self._waiting:
                 return None
             sample = self._waiting.popleft()
@@ -65,7 +65,7 @@ class Inbox:
             return sample
 
     def close(self) -> None:
-        """Release a publisher that waits for room."""
+        """Release whoever waits: a publisher for room, the consumer for samples."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -113,17 +113,21 @@ class EstimatorHost:
         self._subscriptions: list[Subscription] = [topic.subscribe(arrived) for topic in inputs]
         self._timer: Timer | None = None
         if not clock.simulated:
-            self._timer = clock.every(_IDLE_POLL_S, self.work, name="estimator")
+            self._timer = clock.call_at(clock.now_ns(), self._serve, name="estimator")
 
-    def work(self) -> None:
-        """Consume everything that waits."""
-        while (sample := self.inbox.take()) is not None:
+    def _serve(self) -> None:
+        """The thread's life: consume until the inbox is closed and empty."""
+        self._work(wait=True)
+
+    def _work(self, *, wait: bool = False) -> None:
+        while (sample := self.inbox.take(wait=wait)) is not None:
             if self._keep_samples:
                 self.recorded.append(sample)
             try:
                 estimates = self._consumer.update(sample)
             except Exception as error:
                 self._failure = error
+                self.inbox.close()  # nobody consumes any more: no publisher may wait for room
                 raise
             for estimate in estimates:
                 self._publish(estimate)
@@ -136,14 +140,14 @@ class EstimatorHost:
         """
         for subscription in self._subscriptions:
             subscription.cancel()
+        self.inbox.close()
         if self._timer is not None:
             self._timer.cancel()
         if self._failure is None:
-            self.work()
-        self.inbox.close()
+            self._work()
         if self._failure is not None:
             raise self._failure
 
     def _arrived_inline(self, sample: Sample) -> None:
         self.inbox.put(sample)
-        self.work()
+        self._work()
