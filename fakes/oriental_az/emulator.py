@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import pydantic
@@ -11,8 +12,7 @@ from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
 from microdrivers.fakes.oriental_az.drive import AzDrive
 from microdrivers.fakes.oriental_az.rtu import RtuSlave
-from microdrivers.fakes.wire import Wire, register_wire, wire_named
-from microdrivers.fakes.wire.wire import forget_wire
+from microdrivers.fakes.wire import Wire, forget_wire, register_wire, serve_wire
 from microdrivers.fakes.world.axis import Axis
 
 
@@ -68,11 +68,12 @@ def _attach(request: EmulationRequest) -> Emulation:
     )
     url = register_wire(request.name, wire)
 
-    def close() -> None:
-        if wire_named(request.name) is wire:
-            forget_wire(request.name)
-
-    return Emulation(overrides={"connection": {"port": url}}, close=close, wire_log=wire.log)
+    return Emulation(
+        overrides={"connection": {"port": url}},
+        close=lambda: forget_wire(request.name, wire),
+        wire_log=wire.log,
+        serve=partial(serve_wire, request.name, wire, request.clock),
+    )
 
 
 def _parse(name: str, settings: Mapping[str, Any]) -> _Settings:

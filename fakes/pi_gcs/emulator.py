@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +16,7 @@ from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
 from microdrivers.fakes.pi_gcs.axis_channel import AxisChannel, AxisSpec
 from microdrivers.fakes.pi_gcs.controller import GcsController
 from microdrivers.fakes.pi_gcs.state import ControllerState
-from microdrivers.fakes.wire import Wire, forget_wire, register_wire
+from microdrivers.fakes.wire import Wire, forget_wire, register_wire, serve_wire
 from microdrivers.fakes.world.axis import Axis, Encoder
 
 _BITS_PER_BYTE = 10
@@ -147,9 +148,13 @@ def attach(request: EmulationRequest) -> Emulation:
     url = register_wire(request.name, wire)
     return Emulation(
         overrides={"connection": {"port": url}},
-        close=lambda: forget_wire(request.name),
+        close=lambda: forget_wire(request.name, wire),
         wire_log=wire.log,
+        serve=partial(serve_wire, request.name, wire, request.clock, overrides=_ON_A_REAL_PORT),
     )
 
+
+# How late the operating system hands a request over, the emulator cannot know and the host must allow for.
+_ON_A_REAL_PORT = {"latch": {"delay_ms": 0.2, "uncertainty_ms": 0.5}}
 
 EMULATOR = Emulator(attach=attach)

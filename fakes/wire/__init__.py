@@ -1,5 +1,6 @@
 """An emulated serial line: baud pacing, delays and seeded fragments between a driver and an emulator."""
 
+from microdrivers.fakes.wire.bridge import Cable, serve_wire
 from microdrivers.fakes.wire.wire import (
     Reply,
     Temper,
@@ -10,4 +11,14 @@ from microdrivers.fakes.wire.wire import (
     wire_named,
 )
 
-__all__ = ["Reply", "Temper", "Wire", "WireEmulator", "forget_wire", "register_wire", "wire_named"]
+__all__ = [
+    "Cable",
+    "Reply",
+    "Temper",
+    "Wire",
+    "WireEmulator",
+    "forget_wire",
+    "register_wire",
+    "serve_wire",
+    "wire_named",
+]

@@ -50,6 +50,7 @@ class Wire:
 
     Attributes:
         log: what passed, as (time at which the last byte is across in ns, "host" | "device", bytes).
+        wakes_itself: whether the wire asks the clock for its emulator's events; False where somebody else turns it.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Wire:
         self.log: list[tuple[int, str, bytes]] = []
         self.plugged = True
         self.in_use = False
+        self.wakes_itself = True
         self._temper = temper or Temper()
         self._random = np.random.default_rng(seed)
         self._to_device_free_ns = 0
@@ -138,7 +140,7 @@ class Wire:
     def _ask_to_be_woken(self) -> None:
         with self._lock:
             due_ns = self.emulator.next_event_ns()
-            if due_ns is None or due_ns == self._wake_at_ns:
+            if due_ns is None or due_ns == self._wake_at_ns or not self.wakes_itself:
                 return
             self._wake_at_ns = due_ns
         self.clock.call_at(due_ns, self._wake, name="emulator")
@@ -190,9 +192,10 @@ def register_wire(name: str, wire: Wire) -> str:
     return f"fake://{name}"
 
 
-def forget_wire(name: str) -> None:
-    """The URL is no longer known."""
-    _wires.pop(name, None)
+def forget_wire(name: str, wire: Wire) -> None:
+    """The URL is no longer known, unless another wire has taken it."""
+    if _wires.get(name) is wire:
+        del _wires[name]
 
 
 def wire_named(name: str) -> Wire | None:

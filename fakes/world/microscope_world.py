@@ -140,7 +140,7 @@ class MicroscopeWorld:
     # ------------------------------------------------------------------ drawing a world
 
     def _device(self, role: str) -> Mapping[str, Any]:
-        name = self._rig.get("microscope", {}).get(role, "")
+        name = (self._rig.get("microscope") or {}).get(role, "")
         settings: Mapping[str, Any] = self._rig.get("devices", {}).get(name, {})
         return settings
 
@@ -189,7 +189,7 @@ class MicroscopeWorld:
     def _draw_optics(self, random: np.random.Generator) -> None:
         world = self.settings.optics
         camera = self._device("camera")
-        microscope = self._rig.get("microscope", {})
+        microscope = self._rig.get("microscope") or {}
         pitch_um = float(camera.get("pixel_pitch_um", 7.4))
         lens = float(microscope.get("objective", 1.5)) * float(microscope.get("adapter", 1.0))
         drift = self.settings.stage.drift_spread_um_s

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import pydantic
 
@@ -88,6 +89,38 @@ class EmulationRequest:
 
 
 @dataclass(frozen=True)
+class ServeRequest:
+    """Where an emulator is to be put, for other programs to use.
+
+    Attributes:
+        transport: of serial lines: pseudo-terminals or TCP ports. Cameras are served over HTTP in either case.
+        bind: address for TCP and HTTP.
+        folder: where stable names of pseudo-terminals are made.
+    """
+
+    transport: Literal["pty", "tcp"]
+    bind: str
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A port on which an emulator is served.
+
+    Attributes:
+        overrides: merged over the device's settings, so that a driver in another process connects to it.
+        where: the port's name, for people.
+        close: ends serving.
+        control: what a test may pull and put back, if the port can.
+    """
+
+    overrides: Mapping[str, Any]
+    where: str
+    close: Callable[[], None]
+    control: object = None
+
+
+@dataclass(frozen=True)
 class Emulation:
     """A running emulator.
 
@@ -95,11 +128,13 @@ class Emulation:
         overrides: merged over the device's settings, so that the driver connects to the emulator.
         close: ends the emulator.
         wire_log: what passed on the wire, as (t_ns, "host" | "device", bytes), if the device has one.
+        serve: puts the emulator on an operating-system port, if it can.
     """
 
     overrides: Mapping[str, Any]
     close: Callable[[], None]
     wire_log: list[tuple[int, str, bytes]] = field(default_factory=list)
+    serve: Callable[[ServeRequest], Endpoint] | None = None
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class Simulation:
     def settings_of(self, name: str) -> DeviceSettings:
         """A device's settings, pointing at its emulator."""
         entry = self._description.devices[name]
-        merged = _merge(entry.settings.model_dump(mode="python"), self.emulations[name].overrides)
+        merged = merge_settings(entry.settings.model_dump(mode="python"), self.emulations[name].overrides)
         settings: DeviceSettings = entry.driver.settings.model_validate(merged)
         return settings
 
@@ -111,9 +111,12 @@ def _beside(rig_file: Path) -> Path | None:
     return candidate if candidate.exists() else None
 
 
-def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merge_settings(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over`, nested mappings merged."""
     merged = dict(base)
     for key, value in over.items():
         inner = merged.get(key)
-        merged[key] = _merge(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
+        merged[key] = (
+            merge_settings(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
+        )
     return merged

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
 
 from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
-from microdrivers.rig import Rig, build_rig
+from microdrivers.rig import Rig, build_rig, load_rig_file, open_rig
+from microdrivers.rig.serving import ServedRig
 
 
 @dataclass
@@ -74,6 +79,41 @@ def zoom_bench(driver: type[Any] | None = None, *, seed: int = 3) -> Iterator[Zo
     _replace(rig, "zoom", driver)
     with rig:
         world: Any = rig.simulation.world
+        yield ZoomBench(rig.device("zoom", ZoomMotor), rig.clock, world.zoom_axis.position_at)
+
+
+@contextmanager
+def served(transport: Literal["pty", "tcp"], *devices: str, seed: int = 3) -> Iterator[tuple[Rig, ServedRig]]:
+    """Some devices of the workstation in real time, on ports of the operating system."""
+    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    data.pop("microscope")
+    data["devices"] = {name: data["devices"][name] for name in devices}
+    with tempfile.TemporaryDirectory() as folder:
+        part, pointing = Path(folder) / "part.yaml", Path(folder) / "served.yaml"
+        part.write_text(yaml.safe_dump(data), encoding="utf-8")
+        world = Path(folder) / "world.yaml"
+        world.write_text("stage: {power_on_spread_um: 30}\n", encoding="utf-8")  # a short way to the reference
+        with ServedRig(load_rig_file(part), transport=transport, seed=seed, world=world) as serving:
+            serving.write(pointing)
+            with open_rig(pointing) as rig:
+                yield rig, serving
+
+
+@contextmanager
+def served_stage_bench(transport: Literal["pty", "tcp"]) -> Iterator[StageBench]:
+    """The GCS stage on a port of the operating system."""
+    with served(transport, "sample_stage") as (rig, serving):
+        stage = rig.device("sample_stage", XYThetaStage)
+        world: Any = serving.simulation.world
+        stage.reference(["x", "y", "theta"])
+        yield StageBench(stage, rig.clock, lambda axis, t_ns: world.stage_axes[axis].position_at(t_ns))
+
+
+@contextmanager
+def served_zoom_bench(transport: Literal["pty", "tcp"]) -> Iterator[ZoomBench]:
+    """The AZ zoom on a port of the operating system."""
+    with served(transport, "zoom") as (rig, serving):
+        world: Any = serving.simulation.world
         yield ZoomBench(rig.device("zoom", ZoomMotor), rig.clock, world.zoom_axis.position_at)
 
 

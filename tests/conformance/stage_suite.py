@@ -45,7 +45,7 @@ def reads_where_it_is(bench: StageBench) -> None:
 
 @SUITE.check
 def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
-    """In motion at 1 mm/s, the pose is that of its stamp within noise and the stated uncertainty of time."""
+    """In motion at 1 mm/s, the pose is that of its stamp within noise and the stated (95 %) uncertainty of time."""
     samples: list[XYThetaSample] = []
     bench.stage.topic.subscribe(samples.append)
     move = bench.stage.start_move_to(x_um=8200.0, speed_um_s=1000.0)
@@ -54,10 +54,12 @@ def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
     move.wait()
     moving = [sample for sample in samples if sample.moving]
     assert len(moving) > 30
-    for sample in moving:
-        allowed_um = bench.noise_um + 1000.0 * 2.5e-9 * sample.dt_ns
-        assert abs(sample.x_um - bench.truth("x", sample.t_ns)) <= allowed_um
-        assert sample.dt_ns <= 1_000_000
+    within = [
+        abs(sample.x_um - bench.truth("x", sample.t_ns)) <= bench.noise_um + 1000.0 * 1.5e-9 * sample.dt_ns
+        for sample in moving
+    ]
+    assert sum(within) >= 0.9 * len(within)
+    assert max(sample.dt_ns for sample in moving) <= 1_000_000
 
 
 @SUITE.check

@@ -53,7 +53,7 @@ def wire(clock: SimulatedClock) -> Iterator[Wire]:
     wire = Wire(Echo(), clock=clock, seed=1, baudrate=9600, temper=POLITE)
     register_wire("echo", wire)
     yield wire
-    forget_wire("echo")
+    forget_wire("echo", wire)
 
 
 @pytest.fixture
@@ -196,8 +196,8 @@ def test_a_second_open_is_refused(wire: Wire, port: serial.SerialBase) -> None:
 
 def test_an_unknown_name_is_refused(wire: Wire) -> None:
     assert wire_named("echo") is wire
-    forget_wire("echo")
-    forget_wire("echo")
+    forget_wire("echo", wire)
+    forget_wire("echo", wire)
     assert wire_named("echo") is None
     with pytest.raises(serial.SerialException, match="no such emulator"):
         serial.serial_for_url("fake://echo", timeout=0.5)

@@ -1,0 +1,69 @@
+"""`microdrivers serve`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import click
+
+
+@click.command(short_help="Put every emulator of a rig on a port for other programs.")
+@click.argument("rig", type=click.Path(path_type=Path))
+@click.option(
+    "--transport", type=click.Choice(["pty", "tcp"]), default="pty", show_default=True, help="Of serial lines."
+)
+@click.option("--bind", default="127.0.0.1", show_default=True, help="Address for TCP and HTTP; the default is local.")
+@click.option(
+    "--write", "served", type=click.Path(path_type=Path), help="Write a rig file that points at the endpoints."
+)
+@click.option(
+    "--for", "duration_s", type=click.FloatRange(min=0), help="End after so many seconds; default: at Ctrl-C."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
+@click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
+@click.option("--json", "as_json", is_flag=True, help="Print the endpoints as JSON.")
+def serve(
+    rig: Path,
+    transport: Literal["pty", "tcp"],
+    bind: str,
+    served: Path | None,
+    duration_s: float | None,
+    seed: int,
+    world: Path | None,
+    as_json: bool,
+) -> None:
+    r"""Emulate the rig file RIG in real time and let other programs use it.
+
+    Serial devices appear on pseudo-terminals or TCP ports, cameras as HTTP streams. Other machines are not let in
+    unless --bind says so.
+
+    \b
+    Examples:
+      microdrivers serve lab.yaml --write served.yaml
+      microdrivers calibrate optics --rig served.yaml      in another terminal
+    """
+    from microdrivers.rig import load_rig_file
+    from microdrivers.rig.serving import ServedRig
+
+    with ServedRig(load_rig_file(rig), seed=seed, world=world, transport=transport, bind=bind) as running:
+        if served is not None:
+            running.write(served)
+        where = {name: endpoint.where for name, endpoint in running.endpoints.items()}
+        if as_json:
+            click.echo(json.dumps(where))
+        else:
+            width = max(map(len, where))
+            for name, place in where.items():
+                click.echo(f"{name:<{width}}  {place}")
+            if served is not None:
+                click.echo(f"rig file: {served}")
+            click.echo("serving; Ctrl-C ends it" if duration_s is None else f"serving for {duration_s:g} s")
+        try:
+            if duration_s is not None:
+                running.clock.sleep(duration_s)
+            while duration_s is None:
+                running.clock.sleep(3600.0)
+        except KeyboardInterrupt:
+            click.echo("stopped", err=True)

@@ -1,0 +1,87 @@
+"""Puts every emulator of a rig on a port of its own, for other programs to use."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import SystemClock
+from microdrivers.core.errors import UnsupportedError
+from microdrivers.devices.drivers import Endpoint, ServeRequest
+from microdrivers.rig.rig_file import RigDescription
+from microdrivers.rig.simulation import Simulation, merge_settings
+
+
+class ServedRig:
+    """The emulators of a rig in real time, each on an endpoint. Close it to end them all.
+
+    Raises:
+        UnsupportedError: a driver has no emulator, or one that cannot be served; all such devices are named.
+    """
+
+    def __init__(
+        self,
+        description: RigDescription,
+        *,
+        seed: int = 0,
+        world: Path | None = None,
+        transport: Literal["pty", "tcp"] = "pty",
+        bind: str = "127.0.0.1",
+    ) -> None:
+        self.clock = SystemClock()
+        self.description = description
+        self.simulation = Simulation(description, clock=self.clock, bus=Bus(), seed=seed, world_file=world)
+        self._folder = tempfile.TemporaryDirectory(prefix="microdrivers-")
+        request = ServeRequest(transport=transport, bind=bind, folder=Path(self._folder.name))
+        self.endpoints: dict[str, Endpoint] = {}
+        mute = [name for name, emulation in self.simulation.emulations.items() if emulation.serve is None]
+        try:
+            if mute:
+                raise UnsupportedError(
+                    f"the emulator of {', '.join(mute)} cannot be served",
+                    remedy="remove the device from the rig file that you serve",
+                )
+            for name, emulation in self.simulation.emulations.items():
+                assert emulation.serve is not None
+                self.endpoints[name] = emulation.serve(request)
+        except BaseException:
+            self.close()
+            raise
+
+    def rig_data(self) -> dict[str, Any]:
+        """The rig as plain data, pointing at the endpoints."""
+        data = self.description.as_data()
+        for name, endpoint in self.endpoints.items():
+            data["devices"][name] = merge_settings(data["devices"][name], _plain(endpoint.overrides))
+        return data
+
+    def write(self, file: Path) -> None:
+        """Write a rig file that points at the endpoints."""
+        header = (
+            f"# {self.description.rig.name}, served on the endpoints below for as long as the serving process runs.\n"
+        )
+        file.write_text(header + yaml.safe_dump(self.rig_data(), sort_keys=False, allow_unicode=True), encoding="utf-8")
+
+    def close(self) -> None:
+        """End all endpoints and emulators; idempotent."""
+        for endpoint in self.endpoints.values():
+            endpoint.close()
+        self.endpoints.clear()
+        self.simulation.close()
+        self.clock.close()
+        self._folder.cleanup()
+
+    def __enter__(self) -> ServedRig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _plain(overrides: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: _plain(value) if isinstance(value, Mapping) else value for key, value in overrides.items()}
