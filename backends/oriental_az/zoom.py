@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 
 from microdrivers.backends.lines.serial_line import SerialLine
@@ -105,6 +105,11 @@ class AzZoomMotor(ZoomMotor):
         error = self._drive.read_communication_error()
         if error:
             _log.info("%s: the drive's latest communication error is %02Xh", self.name, error)
+
+    @property
+    def line_counters(self) -> Mapping[str, int]:
+        """What has happened on the line since it was opened."""
+        return vars(self._line.counters)
 
     def _close(self) -> None:
         self._line.close()

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from microdrivers.backends.pi_gcs.axis_map import AxisMap, by_axis
-from microdrivers.backends.pi_gcs.error_codes import meaning_of
+from microdrivers.backends.pi_gcs.error_codes import STOPPED, meaning_of
 from microdrivers.backends.pi_gcs.protocol import Gcs
 from microdrivers.backends.pi_gcs.settings import GcsStageSettings
 from microdrivers.core.errors import ConfigError, LinkTimeout, OutOfRange, ProtocolError
@@ -51,7 +51,9 @@ def inspect(gcs: Gcs, settings: GcsStageSettings, axes: Mapping[str, AxisMap], *
     info = _identify(gcs, settings)
     code = gcs.error()
     if code:
-        _log.warning("%s: error %d (%s) was pending from earlier use; cleared", name, code, meaning_of(code))
+        # Every orderly end of use stops the controller, which it remembers as an error.
+        level = logging.INFO if code == STOPPED else logging.WARNING
+        _log.log(level, "%s: error %d (%s) was pending from earlier use; cleared", name, code, meaning_of(code))
     status_index = _find_axes(gcs, axes, name)
     _check_stage_names(gcs, settings, axes, name)
     low, high, acceleration = (

@@ -85,6 +85,11 @@ class GcsXYThetaStage(XYThetaStage):
             undo.pop_all()
         return found.info
 
+    @property
+    def line_counters(self) -> Mapping[str, int]:
+        """What has happened on the line since it was opened."""
+        return vars(self._line.counters)
+
     def _close(self) -> None:
         self._line.close()
         self._state = ControllerState(self._gcs, self._axis_maps)

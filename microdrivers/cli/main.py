@@ -47,7 +47,9 @@ def main(debug: bool) -> None:
       microdrivers calibrate optics --rig lab.yaml --fake
       microdrivers calibrate optics --images DIR         from a recorded image sequence
       microdrivers check lab.yaml                        validate a rig file without hardware
+      microdrivers doctor lab.yaml                       what is wrong with the rig, and what to try
       microdrivers reference lab.yaml --axes x,y         find the reference of a stage (moves!)
+      microdrivers move lab.yaml sample_stage --x-um 7600
     """
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
     # Also where a shell has started us with SIGINT ignored: whoever drives stages must be stoppable.
@@ -93,4 +95,10 @@ def calibrate() -> None:
 
 _add(calibrate, "optics", "microdrivers.cli.calibrate", "optics", "Camera to stage, through a zoom change.")
 _add(main, "check", "microdrivers.cli.check", "check", "Validate a rig file without touching hardware.")
-_add(main, "reference", "microdrivers.cli.reference", "reference", "Find the reference of a stage's axes (moves!).")
+_add(main, "status", "microdrivers.cli.status", "status", "Who answers, and in which state; nothing moves.")
+_add(main, "doctor", "microdrivers.cli.doctor", "doctor", "Examine every device: what is wrong, what to try.")
+_add(main, "reference", "microdrivers.cli.reference", "reference", "Find the reference of a stage or zoom (moves!).")
+_add(main, "move", "microdrivers.cli.move", "move", "Move a stage or the zoom, and wait until settled.")
+_add(main, "stop", "microdrivers.cli.stop", "stop", "Stop everything that moves, now.")
+_add(main, "serve", "microdrivers.cli.serve", "serve", "Put every emulator of a rig on a port for other programs.")
+_add(main, "snap", "microdrivers.cli.snap", "snap", "Take one fresh frame and write it to a file.")

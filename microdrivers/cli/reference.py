@@ -2,38 +2,90 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from contextlib import closing
+from typing import TYPE_CHECKING
 
 import click
 
+from microdrivers.cli.progress import TerminalProgress
+from microdrivers.cli.rig_options import RigChoice, rig_options
 
-@click.command(short_help="Find the reference of a stage's axes (moves!).")
-@click.argument("rig", type=click.Path(path_type=Path))
-@click.option("--axes", required=True, metavar="A,B,…", help="Axes in the order in which to reference them: x,y,theta.")
-@click.option("--device", default=None, help="Which stage; default: the microscope's sample stage.")
-@click.option("--fake", is_flag=True, help="Replace every connection by its emulator.")
+if TYPE_CHECKING:
+    from microdrivers.core.samples import DeviceEvent
+    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.zoom_motor import ZoomMotor
+    from microdrivers.rig import Rig
+
+
+@click.command(short_help="Find the reference of a stage or the zoom (moves!).")
+@rig_options
+@click.option("--axes", metavar="A,B,…", help="Axes of a stage in the order in which to reference them: x,y,theta.")
+@click.option("--device", help="Which stage or zoom; default: the microscope's sample stage.")
 @click.option("--yes", is_flag=True, help="Do not ask whether the way is free.")
-def reference(rig: Path, axes: str, device: str | None, fake: bool, yes: bool) -> None:
-    r"""Find the reference of a stage of the rig file RIG. THE STAGE MOVES to its reference switches.
+def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool) -> None:
+    r"""Find the reference of a stage or the zoom of the rig file RIG. IT MOVES to its reference switches.
+
+    Asks first whether the way is free. Ctrl-C stops the device. Only that device is opened.
 
     \b
-    Example:
+    Examples:
       microdrivers reference lab.yaml --axes x,y,theta
+      microdrivers reference lab.yaml --device zoom
     """
-    from microdrivers.core.clock import SimulatedClock, SystemClock
-    from microdrivers.core.errors import ConfigError
-    from microdrivers.devices.xytheta_stage import XYThetaStage
-    from microdrivers.rig import open_rig
+    from microdrivers.devices.zoom_motor import ZoomMotor
+    from microdrivers.routines.device_state import state_text
 
-    names = [name.strip() for name in axes.split(",") if name.strip()]
-    with open_rig(rig, fake=fake, clock=SimulatedClock() if fake else SystemClock()) as opened:
-        section = opened.file.microscope
-        if device is None and section is None:
-            raise ConfigError("the rig file names no sample stage", file=str(rig), remedy="add --device NAME")
-        stage = opened.device(device or (section.sample_stage if section else ""), XYThetaStage)
-        if not (yes or fake):
-            click.confirm(f"{stage.name} will move to its reference switches. Is the way free?", abort=True)
-        stage.reference(names)
-        pose = stage.read()
-        click.echo(f"{stage.name}: {', '.join(names)} referenced; now at x {pose.x_um:.2f} µm, y {pose.y_um:.2f} µm, "
-                   f"θ {pose.theta_deg:.5f}°")  # fmt: skip
+    with closing(choice.build()) as rig:
+        found = _find(rig, choice, device)
+        names = _checked_axes(found, axes)
+        found.open()
+        if not (yes or rig.fake):
+            click.confirm(f"{found.name} will move to its reference switches. Is the way free?", abort=True, err=True)
+        progress = TerminalProgress()
+        found.events.subscribe(lambda event: _show(event, progress))
+        if isinstance(found, ZoomMotor):
+            found.reference()
+        else:
+            found.reference(names)
+        what = f"{', '.join(names)} referenced" if names else "reference found"
+        click.echo(f"{found.name}: {what}; now at {state_text(found, found.read())}")
+
+
+def _find(rig: Rig, choice: RigChoice, name: str | None) -> XYThetaStage | ZoomMotor:
+    from microdrivers.core.errors import ConfigError, UnsupportedError
+    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.zoom_motor import ZoomMotor
+
+    section = rig.file.microscope
+    if name is None and section is None:
+        raise ConfigError("the rig file names no sample stage", file=str(choice.file), remedy="add --device NAME")
+    device = rig.devices.get(name or (section.sample_stage if section else ""))
+    if isinstance(device, XYThetaStage | ZoomMotor):
+        return device
+    known = [other for other, each in rig.devices.items() if isinstance(each, XYThetaStage | ZoomMotor)]
+    found = "is no device of this rig" if device is None else "has no reference"
+    raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(known) or 'none: nothing can move'}")
+
+
+def _checked_axes(device: XYThetaStage | ZoomMotor, axes: str | None) -> list[str]:
+    """The axes that were named, refused before anything is opened or asked if they are not the device's."""
+    from microdrivers.core.errors import OutOfRange, UnsupportedError
+    from microdrivers.devices.xytheta_stage import AXES
+    from microdrivers.devices.zoom_motor import ZoomMotor
+
+    names = [name.strip() for name in (axes or "").split(",") if name.strip()]
+    if isinstance(device, ZoomMotor):
+        if axes is not None:
+            raise UnsupportedError("a zoom has one axis only", device=device.name, remedy="leave out --axes")
+        return []
+    if not names or len(set(names)) != len(names) or not set(names) <= set(AXES):
+        raise OutOfRange(
+            f"axes to reference: {', '.join(names) or 'none'}", device=device.name,
+            remedy=f"name each of {', '.join(AXES)} at most once, in the order that is safe: --axes {','.join(AXES)}",
+        )  # fmt: skip
+    return names
+
+
+def _show(event: DeviceEvent, progress: TerminalProgress) -> None:
+    if event.kind == "reference_found" and event.reason:
+        progress.step(f"{event.reason} has found its reference")

@@ -1,0 +1,104 @@
+"""`microdrivers stop`."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from microdrivers.cli.main import EXIT_ERROR
+from microdrivers.cli.rig_options import RigChoice, rig_options
+
+if TYPE_CHECKING:
+    from microdrivers.core.errors import MicrodriversError
+    from microdrivers.devices.base import Device
+    from microdrivers.rig import Rig
+
+_STANDSTILL_S = 2.0
+_POLL_S = 0.05
+
+
+class _Told(NamedTuple):
+    """What became of one device: `error` None means that the stop command was sent."""
+
+    device: Device[Any]
+    error: MicrodriversError | None
+
+
+@click.command(short_help="Stop everything that moves, now.")
+@rig_options
+def stop(choice: RigChoice) -> None:
+    r"""Tell every device of the rig file RIG that can move to stop, each as soon as it can be reached.
+
+    All are reached for at once; none waits for another. What was told to stop is then watched until it stands still.
+    Exit status 0 if everything was reached and stands still, else 1: use the emergency stop then.
+
+    A serial port belongs to one program at a time. If another program moves the rig, interrupt THAT program (Ctrl-C,
+    or kill -TERM with its process id): every microdrivers command stops the rig when it is interrupted.
+
+    \b
+    Example:
+      microdrivers stop lab.yaml
+    """
+    from microdrivers.devices.camera import Camera
+
+    with closing(choice.build()) as rig:
+        moving = [device for device in rig.devices.values() if not isinstance(device, Camera)]
+        told = _tell_all(rig, moving)
+        width = max(map(len, rig.devices))
+        failed = False
+        for device, error in told:
+            text, bad = (_unreached(error), True) if error is not None else _watch(device)
+            failed |= bad
+            click.echo(f"{device.name:<{width}}  {text}")
+    if failed:
+        click.echo("not everything is known to stand still: use the emergency stop", err=True)
+        sys.exit(EXIT_ERROR)
+
+
+def _tell_all(rig: Rig, devices: list[Device[Any]]) -> list[_Told]:
+    """Reach for all at once; a simulated clock allows only one after the other."""
+    if rig.clock.simulated or not devices:
+        return [_tell(device) for device in devices]
+    with ThreadPoolExecutor(len(devices), thread_name_prefix="stop") as pool:
+        return list(pool.map(_tell, devices))
+
+
+def _tell(device: Device[Any]) -> _Told:
+    from microdrivers.core.errors import MicrodriversError
+
+    try:
+        device.open()  # there is no line to send a stop on before
+        device.stop(by="user", reason="microdrivers stop")
+    except MicrodriversError as error:
+        return _Told(device, error)
+    return _Told(device, None)
+
+
+def _unreached(error: MicrodriversError) -> str:
+    lines = [f"{click.style('NOT REACHED', fg='red', bold=True)}: {error.what}"]
+    if error.remedy:
+        lines.append(f"    to do: {error.remedy}; if another program holds the port, interrupt that program")
+    return "\n".join(lines)
+
+
+def _watch(device: Device[Any]) -> tuple[str, bool]:
+    """What is seen of a device that was told to stop, and whether that is bad."""
+    from microdrivers.core.errors import MicrodriversError
+    from microdrivers.core.units import seconds_to_ns
+    from microdrivers.routines.device_state import state_text
+
+    deadline_ns = device.clock.now_ns() + seconds_to_ns(_STANDSTILL_S)
+    try:
+        sample = device.read()
+        while getattr(sample, "moving", False) and device.clock.now_ns() < deadline_ns:
+            device.clock.sleep(_POLL_S)
+            sample = device.read()
+    except MicrodriversError as error:
+        return f"told to stop; whether it stands still is not known: {error.what}", True
+    still_moving = bool(getattr(sample, "moving", False))
+    but = f", but {click.style('STILL MOVING', fg='red', bold=True)}" if still_moving else ""
+    return f"told to stop{but}: {state_text(device, sample)}", still_moving

@@ -1,0 +1,67 @@
+"""What a check of a rig finds: facts, warnings and problems, each with what to try."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from microdrivers.core.errors import MicrodriversError
+from microdrivers.devices.base import DeviceInfo
+
+Level = Literal["ok", "warning", "problem"]
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One finding; `remedy` is empty if all is well."""
+
+    level: Level
+    what: str
+    remedy: str = ""
+
+
+class DeviceDiagnosis(msgspec.Struct, kw_only=True):
+    """What was found of one device; `figures` holds what was measured, units in the names."""
+
+    name: str
+    driver: str
+    info: DeviceInfo | None = None
+    findings: list[Finding] = msgspec.field(default_factory=list)
+    figures: dict[str, Any] = msgspec.field(default_factory=dict)
+
+    def ok(self, what: str) -> None:
+        """As it should be."""
+        self.findings.append(Finding("ok", what))
+
+    def warn(self, what: str, remedy: str) -> None:
+        """Usable, with a consequence that the user should know."""
+        self.findings.append(Finding("warning", what, remedy))
+
+    def problem(self, what: str, remedy: str) -> None:
+        """Not usable as it is."""
+        self.findings.append(Finding("problem", what, remedy))
+
+    def failed(self, error: MicrodriversError, doing: str = "") -> None:
+        """An error as a problem."""
+        self.problem(f"{doing}: {error.what}" if doing else error.what, error.remedy)
+
+    def judge(self, good: bool, what: str, remedy: str) -> None:
+        """OK or a warning."""
+        if good:
+            self.ok(what)
+        else:
+            self.warn(what, remedy)
+
+
+class Diagnosis(msgspec.Struct, kw_only=True):
+    """What was found of a whole rig."""
+
+    rig: str
+    file: str
+    fake: bool
+    clock: Literal["simulated", "system"]
+    devices: list[DeviceDiagnosis]
+
+    def count(self, level: Level) -> int:
+        """Findings of a level."""
+        return sum(finding.level == level for device in self.devices for finding in device.findings)
