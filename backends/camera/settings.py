@@ -14,7 +14,16 @@ _Pixels = Annotated[int, pydantic.Field(gt=0, le=20_000)]
 class CameraDeviceSettings(DeviceSettings):
     """A camera.
 
-    `source` is a URL whose scheme names a frame source. `sensor_size_px` is width, height; `principal_point_px` is
+    `source` is a URL whose scheme names a frame source:
+
+    | source | what it is |
+    |---|---|
+    | `v4l2:///dev/video0`, `v4l2://0` | Video4Linux camera or frame grabber; options: see `opencv_source` |
+    | `mjpeg+http://127.0.0.1:8080/camera_fine` | HTTP stream of images, as `microdrivers serve` sends |
+    | `images:///folder/img_%04d.png` | numbered images of a folder, played at `rate_hz` |
+    | `video:///path/film.avi` | a film, played at `rate_hz` |
+
+    `sensor_size_px` is width, height; `principal_point_px` is
     where the optical axis meets the sensor, full-sensor pixels from the centre of the top-left pixel (default: the
     middle). `arrival_delay_ms` ± `arrival_uncertainty_ms` (95 %) say how long after mid-exposure a frame arrives;
     they are used only for sources that cannot tell the time of capture.

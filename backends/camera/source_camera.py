@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 
+import msgspec
+
 from microdrivers.backends.camera.settings import CameraDeviceSettings
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.errors import MicrodriversError, UnsupportedError
 from microdrivers.core.samples import Frame
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.base import DeviceInfo
@@ -41,14 +43,15 @@ class SourceCamera(Camera):
     def _open(self) -> DeviceInfo:
         source = find_frame_source(self._rig.source, self.clock)
         source.open()
-        if source.sensor_size_px != self.sensor_size_px:
+        try:
+            self._check_identity(source)
+            self.settings = source.configure(self.settings)
+            if self._users:  # it was lost and is back while somebody waits for frames
+                source.start(self._take, self._lose)
+        except MicrodriversError:
             source.close()
-            raise UnsupportedError(
-                f"the camera has {source.sensor_size_px} px, the rig file says {self.sensor_size_px}",
-                remedy="correct sensor_size_px in the rig file, or check that it is the right camera",
-            )
+            raise
         self._source = source
-        self.settings = source.configure(self.settings)
         return DeviceInfo(driver="camera", model=source.model, serial_number=source.serial_number)
 
     def _close(self) -> None:
@@ -62,19 +65,37 @@ class SourceCamera(Camera):
 
     def _configure(self, wanted: CameraSettings) -> CameraSettings:
         source = self._require_source()
-        if self._users:
-            source.stop()
-        confirmed = source.configure(wanted)
-        if self._users:
-            source.start(self._take)
+        if not self._users:
+            return source.configure(wanted)
+        source.stop()
+        try:
+            confirmed = source.configure(wanted)
+            # Known before the first frame that has them.
+            self.settings = msgspec.structs.replace(confirmed, settings_id=self.settings.settings_id + 1)
+        finally:
+            source.start(self._take, self._lose)
         return confirmed
 
     def _start(self) -> None:
         self._last_frame_id = None
-        self._require_source().start(self._take)
+        self._require_source().start(self._take, self._lose)
 
     def _halt(self) -> None:
-        self._require_source().stop()
+        if self._source is not None:
+            self._source.stop()
+
+    def _check_identity(self, source: FrameSource) -> None:
+        if source.sensor_size_px != self.sensor_size_px:
+            raise UnsupportedError(
+                f"the camera has {source.sensor_size_px} px, the rig file says {self.sensor_size_px}",
+                remedy="correct sensor_size_px in the rig file, or check that it is the right camera",
+            )
+        known = self.info.serial_number
+        if known and source.serial_number != known:
+            raise UnsupportedError(
+                f"camera {source.serial_number or 'without a serial number'} answers in the place of {known}",
+                remedy="connect the camera that was there before, or open the rig anew",
+            )
 
     def _require_source(self) -> FrameSource:
         self._require_open()
@@ -100,7 +121,8 @@ class SourceCamera(Camera):
         centre = (binning - 1) / 2
         t_ns, dt_ns = raw.t_ns, raw.dt_ns
         if t_ns is None:
-            t_ns = self.clock.now_ns() - round(self._rig.arrival_delay_ms * NS_PER_MS)
+            arrived_ns = raw.arrived_ns if raw.arrived_ns is not None else self.clock.now_ns()
+            t_ns = arrived_ns - round(self._rig.arrival_delay_ms * NS_PER_MS)
             dt_ns = round(self._rig.arrival_uncertainty_ms * NS_PER_MS)
         self.topic.publish(
             Frame(

@@ -128,10 +128,11 @@ def select_bands(image: GreyImage, quad: FloatArray, *, half_width: float, corne
     outlines = _outlines(frames, half_width, corner_gap) - low
     for k, outline in enumerate(np.rint(outlines * 16).astype(np.int32)):
         cv2.fillConvexPoly(edge_of, outline, k + 1, lineType=cv2.LINE_8, shift=4)
-    cells = np.flatnonzero(edge_of)
+    cells = np.flatnonzero(edge_of > 0)
     edges = edge_of.ravel()[cells]
-    cells = cells[np.argsort(edges, kind="stable")]
-    counts = tuple(np.bincount(edges, minlength=5)[1:].tolist())
+    by_edge = np.argsort(edges, kind="stable")
+    cells = cells[by_edge]
+    counts = tuple(np.diff(np.searchsorted(edges[by_edge], np.arange(1, 6, dtype=np.uint8))).tolist())
     bands = Bands(np.empty((5, len(cells)), np.float32), cells, box_shape, _parts(counts), counts)
 
     grey, across, along, u, v = bands.pixels

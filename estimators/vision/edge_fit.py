@@ -24,6 +24,8 @@ Float32Array = npt.NDArray[np.float32]
 _MAX_ITERATIONS = 12
 _CONVERGED_PX = 2e-3
 """A Gauss–Newton step this small leaves an error of some 1e-5 px."""
+_MAX_STEP = 20.0
+"""A step of so many px, or of the logarithm of the blur, leads nowhere."""
 _OUTLIER_SIGMAS = 4.5
 _PATCH_TOLERANCE = 0.01
 """A patch whose mean is off by less than this share of the contrast is uneven light, not dust."""
@@ -127,6 +129,8 @@ def _fit_from(image: GreyImage, start: Start, full_scale: float) -> EdgeFit | No
         solution = _minimise(bands, solution.parameters)
         if solution is None:
             return None
+    if np.abs(solution.parameters[:_LOG_BLUR]).max() > 0.25 * shortest:
+        return None
     variance = solution.at.cost / (sum(bands.counts) - _PARAMETERS)
     corners, covariances = _corners(start.quad, solution.parameters, variance * solution.inverse_normal)
     return EdgeFit(
@@ -176,7 +180,7 @@ def _minimise(bands: Bands, parameters: FloatArray) -> _Solution | None:
             damped.ravel()[:: _PARAMETERS + 1] *= 1.0 + damping
             step = np.linalg.solve(damped, here.gradient)
             largest = float(np.abs(step[: _LOG_BLUR + 1]).max())
-            if not abs(step[_LOG_BLUR]) < 3.0 or not math.isfinite(largest):
+            if not largest < _MAX_STEP:
                 return None
             if largest < _CONVERGED_PX:
                 parameters = parameters + step

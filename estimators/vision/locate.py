@@ -40,7 +40,7 @@ _NOISE_RATIO = 2.0
 _MAX_FITS = 3
 
 
-class SquareFit(msgspec.Struct, frozen=True, kw_only=True):
+class SquareFit(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A square located in one image.
 
     Attributes:
@@ -134,13 +134,13 @@ def locate_square(
 
 def _in_order_of_choice(quads: list[FloatArray], near_px: tuple[float, float] | None) -> tuple[list[FloatArray], int]:
     """Candidates in the order in which to try them, and the number of rivals of the largest."""
-    largest = float(side_lengths(quads[0]).mean())
-    n_rivals = sum(float(side_lengths(quad).mean()) ** 2 >= 0.5 * largest**2 for quad in quads)
-    rivals, others = quads[:n_rivals], quads[n_rivals:]
-    if near_px is not None and n_rivals > 1:
+    areas = [float(side_lengths(quad).mean()) ** 2 for quad in quads]
+    rivals = [quad for quad, area in zip(quads, areas, strict=True) if area >= 0.5 * areas[0]]
+    others = [quad for quad, area in zip(quads, areas, strict=True) if area < 0.5 * areas[0]]
+    if near_px is not None:
         point = np.array(near_px)
-        rivals = sorted(rivals, key=lambda quad: float(np.hypot(*(quad.mean(axis=0) - point))))
-    return rivals + others, n_rivals - 1
+        rivals.sort(key=lambda quad: float(np.hypot(*(quad.mean(axis=0) - point))))
+    return rivals + others, len(rivals) - 1
 
 
 def _nothing_detected(image: GreyImage, full_scale: float, *, partly_in_view: bool) -> SquareNotFound:

@@ -29,6 +29,7 @@ FOLLOWING, PRECEDING = ORDER[1], ORDER[3]
 _COARSE_ROWS = 240
 _MAX_REDUCTION = 4
 _CELL = 12
+_RIDGE = 1e-6 * np.eye(6)
 _MAX_CANDIDATES = 6
 
 
@@ -65,7 +66,6 @@ def find_quadrilaterals(image: GreyImage, *, min_side_px: float) -> Detection:
     pitch = np.array([columns / size[0], rows / size[1]])
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if reduction > 1 else image
     flat = _flatten(cv2.GaussianBlur(coarse, (5, 5), 1.0))
-
     min_side = min_side_px / float(pitch.mean())
 
     quads: list[FloatArray] = []
@@ -135,7 +135,8 @@ def _flatten(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
             break
         chosen = agreeing
         a = basis[agreeing]
-        surface = basis @ np.linalg.solve(a.T @ a, a.T @ levels[agreeing])
+        # The ridge matters only where the agreeing cells do not determine the surface.
+        surface = basis @ np.linalg.solve(a.T @ a + _RIDGE, a.T @ levels[agreeing])
     background = cv2.resize(
         surface.reshape(cells.shape).astype(np.float32),
         (image.shape[1], image.shape[0]),

@@ -26,6 +26,7 @@ _CONVERGED_PX = 1e-4
 _MAX_REFINEMENT_PX = 2.5
 _SMOOTHING_PX = 1.5
 _STRUCTURE_RATIO = 3.0
+_MIN_INDEPENDENCE = 1e-4
 _ROUNDING_VARIANCE = 1.0 / 12.0
 
 
@@ -51,34 +52,24 @@ class Template:
     """The texture in a window of one image, which never changes afterwards.
 
     Least squares in the inverse-compositional form: the image, sampled at the current shift, is projected on the
-    template, its two derivatives and a constant; that projection is computed once. Four more columns, linear in
+    template, its two derivatives and a constant; that projection is computed once. Four more terms, linear in
     the place, tell a change of scale, angle or shape from noise.
 
-    Args:
-        image: grey levels, rows × columns.
-        centre: (column, row) of the window's centre.
-        half: half-sizes (columns, rows) of the window: it spans 2·half + 1 pixels, stays `MARGIN_PX` inside
-            the image and must have structure, see `has_structure`.
+    Made by `take_template`.
     """
 
-    def __init__(self, image: Float32Array, *, centre: tuple[int, int], half: tuple[int, int]) -> None:
-        (u, v), (a, b) = centre, half
-        self._centre = np.array([u, v], dtype=np.float64)
-        self._half = np.array([a, b])
-        self._size = (2 * a + 1, 2 * b + 1)
-        framed = image[v - b - 1 : v + b + 2, u - a - 1 : u + a + 2].astype(np.float64)
-        patch = framed[1:-1, 1:-1]
-        by_u = 0.5 * (framed[1:-1, 2:] - framed[1:-1, :-2])
-        by_v = 0.5 * (framed[2:, 1:-1] - framed[:-2, 1:-1])
-        self._level = float(patch.mean())
-        self._chip_half = np.array([a // 2, b // 2])
-        self._chip = _window(image, self._centre.astype(int), self._chip_half)
+    def __init__(
+        self, image: Float32Array, rows: FloatArray, *, centre: tuple[int, int], half: tuple[int, int]
+    ) -> None:
+        self._centre = np.array(centre, dtype=np.float64)
+        self._half = np.array(half)
+        self._size = (2 * half[0] + 1, 2 * half[1] + 1)
+        self._level = float(_window(image, centre, half).mean(dtype=np.float64))
+        self._chip_half = np.array(_chip_half(half))
+        self._chip = np.ascontiguousarray(_window(image, centre, _chip_half(half)))
         self._reduction = int(min(_MAX_REDUCTION, max(1, min(image.shape) // _COARSE_ROWS)))
         self._coarse_chip = _reduced(self._chip, self._reduction)
 
-        y, x = np.mgrid[-b : b + 1, -a : a + 1].astype(np.float64)
-        columns = [by_u, by_v, patch - self._level, np.ones_like(patch), x * by_u, y * by_u, x * by_v, y * by_v]
-        rows = np.stack([column.ravel() for column in columns])
         normal = rows @ rows.T
         self._rows = rows[:4]
         self._inverse_normal = np.linalg.inv(normal[:4, :4])
@@ -137,7 +128,8 @@ class Template:
     def _judge(self, sampled: FloatArray, fitted: FloatArray, shift: FloatArray) -> Match:
         residuals = sampled - np.einsum("i,ij->j", fitted, self._rows)
         squares = float((residuals * residuals).sum())
-        correlation = math.sqrt(max(0.0, 1.0 - squares / (len(residuals) * float(sampled.var()))))
+        total = len(residuals) * float(sampled.var())
+        correlation = math.sqrt(max(0.0, 1.0 - squares / total)) if total > 0.0 else 0.0
         gain = float(fitted[2])
         variance = max(squares / (len(residuals) - 4), _ROUNDING_VARIANCE) / gain**2
         affine = _product(self._deformation, sampled) / gain
@@ -168,9 +160,13 @@ def _interpolator(part: float) -> FloatArray:
     return np.asarray(factors.prod(axis=1))
 
 
-def _window(image: Float32Array, centre: npt.NDArray[np.int_], half: npt.NDArray[np.int_]) -> Float32Array:
-    (u, v), (a, b) = centre.tolist(), half.tolist()
-    return np.ascontiguousarray(image[v - b : v + b + 1, u - a : u + a + 1])
+def _chip_half(half: tuple[int, int]) -> tuple[int, int]:
+    return half[0] // 2, half[1] // 2
+
+
+def _window(image: Float32Array, centre: tuple[int, int], half: tuple[int, int]) -> Float32Array:
+    (u, v), (a, b) = centre, half
+    return image[v - b : v + b + 1, u - a : u + a + 1]
 
 
 def _reduced(image: Float32Array, factor: int) -> Float32Array:
@@ -181,9 +177,7 @@ def _reduced(image: Float32Array, factor: int) -> Float32Array:
 
 
 def _best_place(image: Float32Array, chip: Float32Array) -> tuple[npt.NDArray[np.int_], float]:
-    """Top-left place (column, row) of `chip` in `image` with the largest correlation coefficient, which
-    is −1 where the image is too small.
-    """
+    """Top-left place (column, row) of `chip` in `image` and its correlation; −1 where the image is too small."""
     if image.shape[0] < chip.shape[0] or image.shape[1] < chip.shape[1]:
         return np.zeros(2, dtype=int), -1.0
     scores = cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED)
@@ -192,10 +186,41 @@ def _best_place(image: Float32Array, chip: Float32Array) -> tuple[npt.NDArray[np
     return np.array(place), float(peak)
 
 
-def has_structure(image: Float32Array, *, centre: tuple[int, int], half: tuple[int, int]) -> bool:
-    """Whether the window varies along both axes by more than white noise does after smoothing."""
-    (u, v), (a, b) = centre, half
-    patch = image[v - b : v + b + 1, u - a : u + a + 1].astype(np.float64)
+def take_template(image: Float32Array, *, centre: tuple[int, int], half: tuple[int, int]) -> Template | None:
+    """Template of a window of `image`, or None if its texture does not fix shift, scale and angle.
+
+    Args:
+        image: grey levels, rows × columns.
+        centre: (column, row) of the window's centre.
+        half: half-sizes (columns, rows): the window spans 2·half + 1 pixels and stays `MARGIN_PX` inside the image.
+    """
+    # The middle half is what the search goes by; the whole window contains it.
+    if not _has_structure(_window(image, centre, _chip_half(half)).astype(np.float64)):
+        return None
+    rows = _model_rows(image, centre, half)
+    lengths = np.sqrt((rows * rows).sum(axis=1))
+    if not lengths.min() > 0.0:
+        return None
+    unit = rows / lengths[:, None]
+    if np.linalg.eigvalsh(unit @ unit.T)[0] < _MIN_INDEPENDENCE:
+        return None
+    return Template(image, rows, centre=centre, half=half)
+
+
+def _model_rows(image: Float32Array, centre: tuple[int, int], half: tuple[int, int]) -> FloatArray:
+    """What an image of the window is made of: both derivatives, texture, constant, derivatives by deformation."""
+    a, b = half
+    framed = _window(image, centre, (a + 1, b + 1)).astype(np.float64)
+    patch = framed[1:-1, 1:-1]
+    by_u = 0.5 * (framed[1:-1, 2:] - framed[1:-1, :-2])
+    by_v = 0.5 * (framed[2:, 1:-1] - framed[:-2, 1:-1])
+    y, x = np.mgrid[-b : b + 1, -a : a + 1].astype(np.float64)
+    parts = [by_u, by_v, patch - patch.mean(), np.ones_like(patch), x * by_u, y * by_u, x * by_v, y * by_v]
+    return np.stack([part.ravel() for part in parts])
+
+
+def _has_structure(patch: FloatArray) -> bool:
+    """Whether `patch` varies along both axes by more than white noise does after smoothing."""
     smooth = cv2.GaussianBlur(patch, (0, 0), _SMOOTHING_PX)
     noise_variance = float(np.var(patch - smooth)) + _ROUNDING_VARIANCE
     by_v, by_u = np.gradient(smooth)

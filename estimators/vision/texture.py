@@ -14,7 +14,7 @@ from microdrivers.estimators.vision.template import (
     FloatArray,
     Match,
     Template,
-    has_structure,
+    take_template,
 )
 
 
@@ -131,6 +131,4 @@ def _take_template(image: Float32Array, start_px: FloatArray, share: float) -> T
     if half.min() < MIN_HALF_PX:
         return None
     (u, v), (a, b) = centre.tolist(), half.tolist()
-    if not has_structure(image, centre=(u, v), half=(a, b)):
-        return None
-    return Template(image, centre=(u, v), half=(a, b))
+    return take_template(image, centre=(u, v), half=(a, b))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -10,11 +10,14 @@ import numpy as np
 from microdrivers.core.clock import Clock, Timer
 from microdrivers.core.errors import LinkLost, UnsupportedError
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
-from microdrivers.devices.camera import CameraSettings, RawFrame
-from microdrivers.devices.drivers import Emulation, EmulationRequest
+from microdrivers.devices.camera import CameraSettings, FrameSink, LossHandler, RawFrame
+from microdrivers.devices.drivers import Emulation, EmulationRequest, Endpoint, ServeRequest
 from microdrivers.devices.frame_sources import register_frame_source
 from microdrivers.fakes.world.microscope_world import MicroscopeWorld, check_world
 from microdrivers.fakes.world.scene import Renderer
+
+_LATE_FRAMES = 8
+_UNPLUGGED = "check its cable and power, then close and open it again"
 
 _sources: dict[str, FakeFrameSource] = {}
 
@@ -29,7 +32,22 @@ def attach(request: EmulationRequest) -> Emulation:
     )  # fmt: skip
     _sources[request.name] = source
     register_frame_source("fake", _open)
-    return Emulation(overrides={"source": f"fake://{request.name}"}, close=lambda: _forget(request.name))
+    settings = CameraSettings(
+        exposure_ms=request.settings["exposure_ms"], gain=1.0, rate_hz=request.settings["rate_hz"],
+        roi=(0, 0, width, height), binning=1, pixel_format="mono8",
+    )  # fmt: skip
+    return Emulation(
+        overrides={"source": f"fake://{request.name}"},
+        close=lambda: _forget(request.name),
+        serve=partial(_serve, request.name, source, settings),
+    )
+
+
+def _serve(name: str, source: FakeFrameSource, settings: CameraSettings, request: ServeRequest) -> Endpoint:
+    from microdrivers.fakes.camera.mjpeg_server import MjpegServer
+
+    server = MjpegServer(name, source, settings, clock=source.clock, bind=request.bind)
+    return Endpoint(overrides={"source": server.url}, where=server.url, close=server.close, control=server)
 
 
 def _open(name: str, clock: Clock) -> FakeFrameSource:
@@ -73,7 +91,7 @@ class FakeFrameSource:
     def open(self) -> None:
         """Connect."""
         if not self.connected:
-            raise LinkLost("the camera does not answer", remedy="check its cable and power", moved="no")
+            raise LinkLost("the camera does not answer", remedy=_UNPLUGGED, moved="no")
 
     def close(self) -> None:
         """Disconnect."""
@@ -88,7 +106,7 @@ class FakeFrameSource:
         self._renderer = Renderer(width, height, self._world.look)
         return self._settings
 
-    def start(self, sink: Callable[[RawFrame], None]) -> None:
+    def start(self, sink: FrameSink, lost: LossHandler) -> None:
         """Expose at the frame rate and deliver each frame some milliseconds after its exposure has ended."""
         settings, renderer = self._settings, self._renderer
         if settings is None or renderer is None:
@@ -101,11 +119,17 @@ class FakeFrameSource:
 
         def deliver() -> None:
             # Which frame this is follows from the grid, not from the calls: a late call must not shift the stamps.
-            number = round((self.clock.now_ns() - first_ns - delay_ns) / period_ns)
-            middle_ns = first_ns + number * period_ns + exposure_ns // 2
-            frame_id = first_id + number
-            self._frames_exposed = frame_id + 1
-            self._deliver(sink, settings, renderer, middle_ns, exposure_ns, frame_id)
+            newest = round((self.clock.now_ns() - first_ns - delay_ns) / period_ns)
+            due = self._frames_exposed - first_id
+            # A busy computer makes frames late, as they are behind a busy bus; it loses them only in the end.
+            for number in range(max(due, newest - _LATE_FRAMES), newest + 1):
+                middle_ns = first_ns + number * period_ns + exposure_ns // 2
+                frame_id = first_id + number
+                self._frames_exposed = frame_id + 1
+                self._deliver(sink, settings, renderer, middle_ns, exposure_ns, frame_id)
+            if not self.connected and self._timer is not None:
+                self._timer.cancel()
+                lost(LinkLost("the camera is gone", remedy=_UNPLUGGED, moved="no"))
 
         self._timer = self.clock.every(
             period_ns / NS_PER_S, deliver, start_ns=first_ns + delay_ns, name="simulated sensor"
@@ -119,7 +143,7 @@ class FakeFrameSource:
 
     def _deliver(
         self,
-        sink: Callable[[RawFrame], None],
+        sink: FrameSink,
         settings: CameraSettings,
         renderer: Renderer,
         middle_ns: int,

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 @click.option("--zoom-to", type=float, default=1.2, show_default=True, help="Zoom after the change.")
 @click.option("--zoom-from", type=float, default=0.9, show_default=True, help="Zoom before the change.")
 @click.option("--frames", type=click.IntRange(min=10), default=100, show_default=True, help="Frames on the circle.")
+@click.option("--settled/--in-motion", default=None, help="Take frames at rest, or never; default: as times are known.")
 @click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON instead of a summary.")
 def optics(
@@ -40,6 +41,7 @@ def optics(
     zoom_to: float,
     zoom_from: float,
     frames: int,
+    settled: bool | None,
     real_time: bool,
     as_json: bool,
 ) -> None:
@@ -66,7 +68,13 @@ def optics(
         if images is not None:
             complete = _from_images(images, out, as_json, progress)
         else:
-            circle = {"radius_um": radius_um, "zoom_from": zoom_from, "zoom_to": zoom_to, "frames": frames}
+            circle = {
+                "radius_um": radius_um,
+                "zoom_from": zoom_from,
+                "zoom_to": zoom_to,
+                "frames": frames,
+                "settled": settled,
+            }
             complete = _on_rig(rig_file, fake, seed, world, out, circle, real_time, as_json, progress)
     finally:
         progress.close()

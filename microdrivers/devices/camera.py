@@ -11,8 +11,8 @@ from typing import Any, Literal, Protocol
 import msgspec
 import numpy.typing as npt
 
-from microdrivers.core.errors import LinkTimeout, OutOfRange, UnsupportedError
-from microdrivers.core.samples import Frame
+from microdrivers.core.errors import LinkLost, LinkTimeout, OutOfRange, UnsupportedError
+from microdrivers.core.samples import DeviceEvent, Frame
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.base import Device
 
@@ -39,12 +39,18 @@ class RawFrame(msgspec.Struct, frozen=True, kw_only=True):
     """What a frame source delivers: pixels and, where the source knows it, the time of mid-exposure.
 
     `t_ns` is None if the source cannot tell; the camera then uses the arrival with `dt_ns` as stated in the rig file.
+    `arrived_ns` is that arrival, for sources that hand frames on later than they receive them.
     """
 
     image: npt.NDArray[Any]
     frame_id: int
     t_ns: int | None
     dt_ns: int
+    arrived_ns: int | None = None
+
+
+FrameSink = Callable[[RawFrame], None]
+LossHandler = Callable[[LinkLost], None]
 
 
 class FrameSource(Protocol):
@@ -59,10 +65,10 @@ class FrameSource(Protocol):
         """Connect."""
 
     def configure(self, wanted: CameraSettings) -> CameraSettings:
-        """Apply settings and read them back."""
+        """Apply settings and read them back; those in force stay in force if it raises."""
 
-    def start(self, sink: Callable[[RawFrame], None]) -> None:
-        """Begin to deliver frames."""
+    def start(self, sink: FrameSink, lost: LossHandler) -> None:
+        """Begin to deliver frames; `lost` is called once, after the last frame, if the device disappears."""
 
     def stop(self) -> None:
         """End delivery."""
@@ -146,7 +152,7 @@ class Camera(Device[Frame]):
         """A frame whose exposure STARTED after this call; older ones that are still under way are let pass.
 
         Raises:
-            LinkTimeout: none came within `timeout_s`.
+            LinkTimeout: none came within `timeout_s`. LinkLost: the camera is gone.
         """
         called_ns = self.clock.now_ns()
         arrived = self.clock.event()
@@ -158,13 +164,15 @@ class Camera(Device[Frame]):
                 fresh.append(frame)
                 arrived.set()
 
-        subscription = self.topic.subscribe(look)
+        subscriptions = (self.topic.subscribe(look), self.events.subscribe(_when_lost(arrived.set)))
         try:
             with self.running():
                 arrived.wait(timeout_s)
         finally:
-            subscription.cancel()
+            for subscription in subscriptions:
+                subscription.cancel()
         if not fresh:
+            self._check_not_lost()
             raise LinkTimeout(
                 f"no frame exposed after the call arrived within {timeout_s:g} s",
                 device=self.name,
@@ -174,7 +182,11 @@ class Camera(Device[Frame]):
         return fresh[0]
 
     def frames(self, *, policy: FramePolicy = "all", timeout_s: float = 1.0) -> Iterator[Frame]:
-        """Frames as they come: every one, or always the newest. Ends only when the caller stops iterating."""
+        """Frames as they come: every one, or always the newest. Ends only when the caller stops iterating.
+
+        Raises:
+            LinkTimeout: none came within `timeout_s`. LinkLost: the camera is gone.
+        """
         waiting: deque[Frame] = deque(maxlen=1 if policy == "latest" else None)
         arrived = self.clock.event()
 
@@ -182,7 +194,7 @@ class Camera(Device[Frame]):
             waiting.append(frame)
             arrived.set()
 
-        subscription = self.topic.subscribe(take)
+        subscriptions = (self.topic.subscribe(take), self.events.subscribe(_when_lost(arrived.set)))
         try:
             with self.running():
                 while True:
@@ -191,8 +203,10 @@ class Camera(Device[Frame]):
                     arrived.clear()
                     while waiting:
                         yield waiting.popleft()
+                    self._check_not_lost()
         finally:
-            subscription.cancel()
+            for subscription in subscriptions:
+                subscription.cancel()
 
     def read(self) -> Frame:
         """A fresh frame, as `grab()`; the camera itself has published it."""
@@ -234,6 +248,22 @@ class Camera(Device[Frame]):
     def _read(self) -> Frame:
         return self.grab()
 
+    # ------------------------------------------------------------------ loss
+
+    _loss: LinkLost | None = None
+
+    def _lose(self, error: LinkLost) -> None:
+        """For drivers, from any thread: the device is gone. Whoever waits for a frame is woken."""
+        if self.link != "open":
+            return
+        self._loss = error
+        self.link = "lost"
+        self._publish_event("link_lost", reason=error.what)
+
+    def _check_not_lost(self) -> None:
+        if self.link == "lost" and self._loss is not None:
+            raise LinkLost(self._loss.what, remedy=self._loss.remedy, device=self.name, moved="no")
+
     # ------------------------------------------------------------------ running
 
     _users: int = 0
@@ -259,3 +289,11 @@ class _Running:
 
     def __exit__(self, *_: object) -> None:
         self._camera._leave()
+
+
+def _when_lost(call: Callable[[], None]) -> Callable[[DeviceEvent], None]:
+    def look(event: DeviceEvent) -> None:
+        if event.kind == "link_lost":
+            call()
+
+    return look

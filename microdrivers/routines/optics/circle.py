@@ -4,45 +4,42 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import ExitStack
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from microdrivers.core.clock import Clock, Timer
 from microdrivers.core.errors import (
     CalibrationError,
     ConfigError,
-    LinkTimeout,
     NotReferenced,
     OutOfRange,
     TargetLost,
     UnsupportedError,
 )
 from microdrivers.core.samples import Frame, TrackedPoint
-from microdrivers.core.units import NS_PER_MS, NS_PER_S, Range, check_range, seconds_to_ns
+from microdrivers.core.units import NS_PER_MS, Range, check_range
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.rig import Rig
+from microdrivers.routines.optics.circle_drive import (
+    Circle,
+    Instruments,
+    Pace,
+    fastest_um_s,
+    step_along,
+    stream_along,
+)
 from microdrivers.routines.optics.source import Optics, SourceNames
 from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.progress import Progress
 
 Array = npt.NDArray[np.float64]
 
-_LEAD_FRAMES = 2.5
-"""The stage is sent to where the circle will be so many frames later: far enough that it never brakes."""
-_TURN_SHARE = 1 / 3
-"""Where between two exposures the stage changes its velocity, as a share of the period after the earlier one: a pose
-after that exposure is read before, and the servo settles before the last pose ahead of the next one."""
-_COMMAND_LEAD_S = 0.0095
-"""From sending a target to the change of velocity: bytes on the line, and a poll that may be under way."""
-_LEAD_IN_FRAMES = 6
-_OLDEST_POSE_S = 0.1
-_SILENCE_NS = NS_PER_S
+LARGEST_TIME_UNCERTAINTY_NS = 200_000
+"""Half-width (95 %) of the time between pose and frame up to which frames are taken in motion: 0.2 ms are 0.024°."""
 _SMALLEST_RADIUS_UM = 50.0
 _LARGEST_RADIUS_UM = 10_000.0
 _PAPER_RADIUS_UM = 300.0
@@ -54,7 +51,9 @@ class CircleSettings(NamedTuple):
     """The experiment's figures; defaults are the paper's.
 
     `radius_um` None means the paper's 300 µm, or as much of it as fits the view; a stated radius must fit.
-    `change_after_frame` is 0-based: the zoom is commanded once that frame has been exposed.
+    `change_after_frame` is 0-based: the zoom is commanded once that frame has been exposed. `settled` True stops at
+    each point before the frame is taken, False never does; None decides by how well the times of poses and frames
+    are known.
     """
 
     radius_um: float | None = None
@@ -67,6 +66,23 @@ class CircleSettings(NamedTuple):
     pose_rate_hz: float = 100.0
     zoom_rate_hz: float = 70.0
     margin_px: float = 20.0
+    settled: bool | None = None
+
+    def pace(self) -> Pace:
+        """What the drive along the circle needs of these settings."""
+        return Pace(
+            radians_per_frame=self.radians_per_frame,
+            frames=self.frames,
+            change_after_frame=self.change_after_frame,
+            zoom_to=self.zoom_to,
+            pose_rate_hz=self.pose_rate_hz,
+            zoom_rate_hz=self.zoom_rate_hz,
+        )
+
+    @property
+    def radians_per_frame(self) -> float:
+        """Angle between two frames."""
+        return math.radians(self.degrees_per_frame)
 
 
 class CircleExperiment:
@@ -95,6 +111,7 @@ class CircleExperiment:
         self._zoom = rig.device(section.zoom, ZoomMotor)
         self._camera = rig.device(section.camera, Camera)
         self._reach_px = 0.0
+        self._settled = bool(self.settings.settled)
         self._check_settings()
 
     def _check_settings(self) -> None:
@@ -113,9 +130,9 @@ class CircleExperiment:
             pixel_pitch_um=self._camera.pixel_pitch_um * camera.binning,
         )  # fmt: skip
 
-    def frames_expected(self) -> int:
-        """Frames on the circle."""
-        return self.settings.frames
+    def frames_expected(self) -> int | None:
+        """Frames on the circle; None at rest, where a point may give more than one."""
+        return None if self._settled else self.settings.frames
 
     def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
         """Run the experiment; whatever happens, the stage and the zoom stand still afterwards."""
@@ -128,8 +145,9 @@ class CircleExperiment:
             self._stage.move_to(x_um=centre[0] + radius_um, y_um=centre[1])
             near_px = jacobian @ np.array([radius_um, 0.0])
             tracker = make_tracker(self._section.target.kind, near_px=(float(near_px[0]), float(near_px[1])))
-            self._require_found(tracker.update(self._camera.grab()))
-            self._stream(centre, radius_um, lambda: begin(tracker), progress)
+            frame = self._camera.grab()
+            self._require_found(tracker.update(frame))
+            self._drive(Circle(centre, radius_um), frame, lambda: begin(tracker), progress)
         finally:
             self._stage.stop(by="calibration", reason="the experiment ended")
             self._zoom.stop(by="calibration", reason="the experiment ended")
@@ -219,7 +237,7 @@ class CircleExperiment:
         in_travel_um = min(
             x_um - limits["x"].min, limits["x"].max - x_um, y_um - limits["y"].min, limits["y"].max - y_um
         )
-        in_speed_um = self._fastest_um_s() / self._angular_speed()
+        in_speed_um = fastest_um_s(self._stage) / (self.settings.radians_per_frame * self._camera.settings.rate_hz)
         fits_um = min(in_view_um, in_travel_um, in_speed_um)
         asked_um = self.settings.radius_um
         needed_um = _SMALLEST_RADIUS_UM if asked_um is None else asked_um
@@ -232,115 +250,15 @@ class CircleExperiment:
             )
         return (x_um, y_um), min(_PAPER_RADIUS_UM, fits_um) if asked_um is None else asked_um
 
-    def _angular_speed(self) -> float:
-        return math.radians(self.settings.degrees_per_frame) * self._camera.settings.rate_hz
-
-    def _fastest_um_s(self) -> float:
-        return 0.8 * min(self._stage.max_speed["x"], self._stage.max_speed["y"])
-
-    # ------------------------------------------------------------------ on the circle
-
-    def _stream(
-        self, centre: tuple[float, float], radius_um: float, begin: Callable[[], None], progress: Progress
-    ) -> None:
-        with ExitStack() as stack:
-            stack.enter_context(self._stage.stream(self.settings.pose_rate_hz))
-            stack.enter_context(self._zoom.stream(self.settings.zoom_rate_hz))
-            arrivals = _Arrivals(self._camera)
-            stack.callback(arrivals.close)
-            stack.enter_context(self._camera.running())
-            arrivals.await_frames(self.clock, 1)
-            started_ns = self.clock.now_ns()
-            for _ in range(_LEAD_IN_FRAMES):
-                self._steer(centre, radius_um, started_ns, arrivals)
-            progress.step("calibrating on the circle")
-            begin()
-            arrivals.restart_count()
-            zoom_change: Timer | None = None
-            while arrivals.count < self.settings.frames:
-                if zoom_change is None and arrivals.count:
-                    zoom_change = self._schedule_zoom_change(arrivals)
-                    stack.callback(zoom_change.cancel)
-                self._steer(centre, radius_um, started_ns, arrivals)
-                progress.count(min(arrivals.count, self.settings.frames), self.settings.frames)
-            # The last frame still needs a pose and a zoom sample after it.
-            self.clock.sleep(3.0 / min(self.settings.pose_rate_hz, self.settings.zoom_rate_hz))
-
-    def _schedule_zoom_change(self, arrivals: _Arrivals) -> Timer:
-        """Command the zoom when the frame after which it is to change has been exposed.
-
-        On the clock and not in the steering loop: the stage must not wait for the zoom's reply.
-        """
-        exposure_ns = round(self._camera.settings.exposure_ms * NS_PER_MS)
-        due_ns = arrivals.first_ns + self.settings.change_after_frame * arrivals.period_ns + exposure_ns
-        return self.clock.call_at(
-            due_ns, lambda: self._zoom.start_move_to(zoom=self.settings.zoom_to), name="zoom change"
-        )
-
-    def _steer(self, centre: tuple[float, float], radius_um: float, started_ns: int, arrivals: _Arrivals) -> None:
-        """Command the next target so that the stage changes its velocity well between two exposures.
-
-        It then runs at constant velocity around each exposure, and its pose may be interpolated there.
-        """
-        now_ns = self.clock.now_ns()
-        arrivals.check_alive(now_ns)
-        command_ns = seconds_to_ns(_COMMAND_LEAD_S)
-        turn_ns = arrivals.next_after_exposure_ns(now_ns + command_ns, share=_TURN_SHARE)
-        self.clock.sleep_until(turn_ns - command_ns)
-        lead_s = _LEAD_FRAMES * arrivals.period_ns / NS_PER_S
-        elapsed_s = (turn_ns - started_ns) / NS_PER_S
-        angle = self._angular_speed() * (elapsed_s + lead_s)
-        x_um = centre[0] + radius_um * math.cos(angle)
-        y_um = centre[1] + radius_um * math.sin(angle)
-        pose = self._stage.latest(max_age_s=_OLDEST_POSE_S)
-        speed_um_s = math.hypot(x_um - pose.x_um, y_um - pose.y_um) / lead_s
-        self._stage.start_move_to(x_um=x_um, y_um=y_um, speed_um_s=min(speed_um_s, self._fastest_um_s()))
-
-
-class _Arrivals:
-    """The times of a camera's frames: how many have come, and when the next will be exposed."""
-
-    def __init__(self, camera: Camera) -> None:
-        self.period_ns = round(NS_PER_S / camera.settings.rate_hz)
-        self.count = 0
-        self.first_ns = 0
-        self._latest_ns = 0
-        self._seen = 0
-        self._camera = camera
-        self._subscription = camera.topic.subscribe(self._arrived)
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._subscription.cancel()
-
-    def restart_count(self) -> None:
-        """Count from the next frame on."""
-        self.count = 0
-
-    def next_after_exposure_ns(self, now_ns: int, *, share: float) -> int:
-        """The first instant after `now_ns` that lies this share of a period after a mid-exposure, by the grid."""
-        grid_ns = self._latest_ns + round(share * self.period_ns)
-        return grid_ns + ((now_ns - grid_ns) // self.period_ns + 1) * self.period_ns
-
-    def await_frames(self, clock: Clock, number: int) -> None:
-        """Wait until so many frames have come."""
-        begun_ns = clock.now_ns()
-        while self._seen < number:
-            self._latest_ns = self._latest_ns or begun_ns
-            self.check_alive(clock.now_ns())
-            clock.sleep(0.002)
-
-    def check_alive(self, now_ns: int) -> None:
-        """Raise if the camera has fallen silent."""
-        if now_ns - self._latest_ns > _SILENCE_NS:
-            raise LinkTimeout(
-                f"no frame for {(now_ns - self._latest_ns) / NS_PER_S:.1f} s", device=self._camera.name,
-                remedy="check the camera's cable and power",
-            )  # fmt: skip
-
-    def _arrived(self, frame: Frame) -> None:
-        if self.count == 0:
-            self.first_ns = frame.t_ns
-        self.count += 1
-        self._seen += 1
-        self._latest_ns = frame.t_ns
+    def _drive(self, circle: Circle, frame: Frame, begin: Callable[[], None], progress: Progress) -> None:
+        """In motion if times are known well enough for that, else at rest."""
+        devices = Instruments(self._stage, self._zoom, self._camera, self.clock)
+        known_to_ns = math.hypot(frame.dt_ns, self._stage.read().dt_ns)
+        if self.settings.settled is None and known_to_ns > LARGEST_TIME_UNCERTAINTY_NS:
+            self._settled = True
+            progress.step(
+                f"pose against frame is known to ±{known_to_ns / NS_PER_MS:.2g} ms only, and motion needs "
+                f"{LARGEST_TIME_UNCERTAINTY_NS / NS_PER_MS:g} ms: taking frames at rest"
+            )
+        drive = step_along if self._settled else stream_along
+        drive(devices, circle, self.settings.pace(), begin, progress)

@@ -46,5 +46,5 @@ class OpticsSource(Protocol):
     def optics(self) -> Optics:
         """What is known of the optics, valid after `run`."""
 
-    def frames_expected(self) -> int:
-        """How many frames the calibration will get, for progress."""
+    def frames_expected(self) -> int | None:
+        """How many frames the calibration takes; None takes all that come."""

@@ -34,9 +34,7 @@ def sample_errors(
             "side_px": side_px,
             "angle_deg": rng.uniform(0, 360),
         }
-        image = scene.square_image(
-            rng, **place, blur_px=blur_px, contrast=contrast, noise=noise, shape=SHAPE
-        )
+        image = scene.square_image(rng, **place, blur_px=blur_px, contrast=contrast, noise=noise, shape=SHAPE)
         fit = locate_square(image)
         assert isinstance(fit, SquareFit), fit
         truth = scene.square_corners(**place)
@@ -60,15 +58,13 @@ def test_reaches_a_hundredth_of_a_pixel_and_knows_it(scene: ModuleType, side_px:
 @pytest.mark.parametrize("blur_px", [0.7, 0.9, 1.2, 2.0, 3.0])
 def test_is_unbiased_at_any_focus(scene: ModuleType, blur_px: float, contrast: float) -> None:
     # Noise of half a grey level only breaks up the rounding: what remains is bias.
-    errors, outward, _ = sample_errors(
-        scene, n=5, seed=2, side_px=80.0, blur_px=blur_px, contrast=contrast, noise=0.5
-    )
+    errors, outward, _ = sample_errors(scene, n=5, seed=2, side_px=80.0, blur_px=blur_px, contrast=contrast, noise=0.5)
     assert np.abs(errors.mean(axis=(0, 1))).max() < 0.003
     assert abs(float(np.mean(np.sum(errors * outward, axis=2)))) < 0.003
     assert np.abs(errors).max() < 0.02
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=40, derandomize=True)
 @given(
     angle_deg=st.floats(0, 360),
     u=st.floats(130, 190),
@@ -242,16 +238,55 @@ def test_a_square_with_bulging_sides_fits_poorly(scene: ModuleType) -> None:
     grey = 60.0 + 120.0 * scene.normal_cdf(45.0 * (1.0 - radius) / 1.2)
     outcome = locate_square(scene.digitise(grey, noise=1.0, rng=np.random.default_rng(9)))
     assert isinstance(outcome, SquareNotFound)
-    assert outcome.reason in ("poor_fit", "no_square")
+    assert outcome.reason == "poor_fit"
+
+
+def test_a_double_edge_fits_poorly(scene: ModuleType) -> None:
+    both = sum(
+        scene.square_coverage(SHAPE, centre=(u, 120.0), side_px=90.0, angle_deg=10.0, blur_px=1.0)
+        for u in (157.0, 163.0)
+    )
+    outcome = locate_square(scene.digitise(60.0 + 60.0 * both, noise=2.0, rng=np.random.default_rng(9)))
+    assert isinstance(outcome, SquareNotFound)
+    assert outcome.reason == "poor_fit"
+
+
+def test_a_mottled_object_fits_poorly(scene: ModuleType) -> None:
+    v, u = np.mgrid[0:240, 0:320]
+    coverage = scene.square_coverage(SHAPE, centre=(160.0, 120.0), side_px=90.0, angle_deg=3.0, blur_px=1.2)
+    mottle = 8.0 * np.sin(2 * np.pi * u / 9.0) * np.sin(2 * np.pi * v / 9.0)
+    image = scene.digitise(60.0 + 100.0 * coverage + mottle, noise=0.5, rng=np.random.default_rng(9))
+    outcome = locate_square(image)
+    assert isinstance(outcome, SquareNotFound)
+    assert outcome.reason == "poor_fit"
+    assert "residuals" in outcome.detail
+
+
+def test_light_that_varies_more_than_the_contrast(scene: ModuleType) -> None:
+    place = {"centre": (200.2, 170.7), "side_px": 80.0, "angle_deg": 25.0}
+    for contrast in (40.0, -40.0):
+        image = scene.square_image(
+            np.random.default_rng(14), **place, contrast=contrast, gradient=(0.15, -0.1), shape=(480, 640)
+        )
+        errors = corner_errors(locate_square(image), scene.square_corners(**place))
+        assert np.abs(errors).max() < 0.12
+
+
+def test_a_short_motion_during_the_exposure_is_averaged(scene: ModuleType) -> None:
+    place = {"side_px": 90.0, "angle_deg": 20.0}
+    path = np.linspace(-0.6, 0.6, 13)
+    mean = sum(scene.square_coverage(SHAPE, centre=(160.0 + s, 120.0), **place, blur_px=1.2) for s in path) / 13
+    fit = locate_square(scene.digitise(60.0 + 120.0 * mean, noise=2.0, rng=np.random.default_rng(9)))
+    errors = corner_errors(fit, scene.square_corners(centre=(160.0, 120.0), **place))
+    assert np.abs(errors).max() < 0.05
 
 
 def test_a_square_far_out_of_focus_is_refused(scene: ModuleType) -> None:
-    image = scene.square_image(
-        np.random.default_rng(10), centre=(160.0, 120.0), side_px=60.0, blur_px=6.5, shape=SHAPE
-    )
+    image = scene.square_image(np.random.default_rng(10), centre=(160.0, 120.0), side_px=60.0, blur_px=6.5, shape=SHAPE)
     outcome = locate_square(image)
     assert isinstance(outcome, SquareNotFound)
-    assert outcome.reason in ("implausible_blur", "no_square")
+    assert outcome.reason == "implausible_blur"
+    assert "6.5" in outcome.detail
 
 
 def test_a_faint_square_is_refused(scene: ModuleType) -> None:
@@ -260,7 +295,7 @@ def test_a_faint_square_is_refused(scene: ModuleType) -> None:
     )
     outcome = locate_square(image)
     assert isinstance(outcome, SquareNotFound)
-    assert outcome.reason in ("low_contrast", "no_square")
+    assert outcome.reason == "low_contrast"
 
 
 def two_squares(scene: ModuleType, sides_px: tuple[float, float]) -> npt.NDArray[Any]:

@@ -34,5 +34,7 @@ class Texture:
         c, s = np.cos(np.deg2rad(angle_deg)) / scale, np.sin(np.deg2rad(angle_deg)) / scale
         along_u = np.outer(u, self._ku * c - self._kv * s)
         along_v = np.outer(v, self._ku * s + self._kv * c) + self._phase
-        waves = np.cos(along_v) @ np.cos(along_u).T - np.sin(along_v) @ np.sin(along_u).T
-        return self._amplitude * waves
+        both_v = np.hstack([np.cos(along_v), -np.sin(along_v)])
+        both_u = np.hstack([np.cos(along_u), np.sin(along_u)])
+        # Not by @: the threads of BLAS and OpenCV would wait for each other.
+        return self._amplitude * np.einsum("vk,uk->vu", both_v, both_u)
