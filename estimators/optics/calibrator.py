@@ -71,6 +71,8 @@ class OpticsCalibrator:
         self._clean_frames = 0
         self._to_flush = 0
         self._moving_before = False
+        self._moved_ns = -1
+        self._previous: tuple[int, float] | None = None
 
     @property
     def unmatched_frames(self) -> int:
@@ -87,6 +89,8 @@ class OpticsCalibrator:
         if isinstance(sample, XYThetaSample):
             self._synchroniser.add_reference("stage", sample)
         elif isinstance(sample, ZoomSample):
+            if sample.moving:
+                self._moved_ns = sample.t_ns
             self._synchroniser.add_reference("zoom", sample)
         elif isinstance(sample, Frame) and self._frames_left > 0:
             self._frames_left -= 1
@@ -111,6 +115,7 @@ class OpticsCalibrator:
     def _estimate(self, point: TrackedPoint, pose: PoseAt, zoom: ZoomSample, next_zoom: ZoomSample) -> OpticsEstimate:
         recursion = self._started(pose)
         moving = self._zoom_moves(zoom, next_zoom)
+        moved = moving or self._zoom_has_moved(point.t_ns, zoom)
         defined = recursion.frames_used >= 3
         prior_error = _distance(recursion.predict(pose.x_um, pose.y_um), point) if defined else math.nan
         recursion.update(
@@ -118,7 +123,7 @@ class OpticsCalibrator:
             y_um=pose.y_um,
             u_px=point.u_px,
             v_px=point.v_px,
-            forgetting=self._forgetting(moving),
+            forgetting=self._forgetting(moving, moved),
             vx_um_s=pose.velocity_x_um_s,
             vy_um_s=pose.velocity_y_um_s,
             sigma_time_s=math.hypot(point.dt_ns, pose.dt_ns) / (_HALF_WIDTH_95 * NS_PER_S),
@@ -142,18 +147,27 @@ class OpticsCalibrator:
         changed = abs(next_zoom.zoom - zoom.zoom) > self.settings.zoom_still * abs(zoom.zoom)
         return zoom.moving or next_zoom.moving or changed
 
-    def _forgetting(self, moving: bool) -> float:
+    def _zoom_has_moved(self, t_ns: int, zoom: ZoomSample) -> bool:
+        """Whether the zoom has moved since the last frame: between two frames it may come and go unseen."""
+        previous, self._previous = self._previous, (t_ns, zoom.zoom)
+        if previous is None:
+            return False
+        previous_ns, previous_zoom = previous
+        changed = abs(zoom.zoom - previous_zoom) > self.settings.zoom_still * abs(previous_zoom)
+        return changed or previous_ns < self._moved_ns <= t_ns
+
+    def _forgetting(self, moving: bool, moved: bool) -> float:
+        """λ for this frame: 0 from the first frame of a motion until the stack holds the new zoom alone."""
         assert self.recursion is not None
-        if moving:
+        if moved:
             if not self._moving_before:
                 self.recursion.switch_prior()
             self._to_flush = self.settings.flush_frames
             self._clean_frames = 0
-        else:
-            self._clean_frames += 1
         self._moving_before = moving
         if moving:
             return 0.0
+        self._clean_frames += 1
         if self._to_flush > 0:
             self._to_flush -= 1
             return 0.0

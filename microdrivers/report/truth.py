@@ -27,7 +27,9 @@ class OpticsTruthCollector:
         """
         if not self.samples or not estimates:
             return None
-        resting = _last_rest(estimates)
+        change = result.zoom_change
+        resting = estimates[change.last_moving_frame + 1 :] if change else estimates
+        resting = resting or estimates[-1:]
         truths = self._matching(resting)
         corner = _tracked_corner(resting, truths)
         projection = _fit([(t.x_um, t.y_um) for t in truths], [_corner(t, corner) for t in truths])
@@ -57,11 +59,6 @@ class OpticsTruthCollector:
         """The truth of each estimate's frame: the nearest in time, since a camera's stamps are a little off."""
         times = np.array([truth.t_ns for truth in self.samples])
         return [self.samples[int(np.argmin(np.abs(times - estimate.t_ns)))] for estimate in estimates]
-
-
-def _last_rest(estimates: list[OpticsEstimate]) -> list[OpticsEstimate]:
-    first = max((i + 1 for i, estimate in enumerate(estimates) if estimate.zoom_moving), default=0)
-    return estimates[first:] or estimates[-1:]
 
 
 def _corner(truth: OpticsTruth, corner: int) -> tuple[float, float]:

@@ -48,9 +48,7 @@ def check_camera(camera: Camera, found: DeviceDiagnosis) -> None:
 def _check_time(frame: Frame, found: DeviceDiagnosis) -> None:
     stated = f"±{frame.dt_ns / NS_PER_MS:.3g} ms"
     found.figures |= {"t_source": frame.t_source, "stated_uncertainty_ms": frame.dt_ns / NS_PER_MS}
-    remedy = (
-        "take a camera or source that stamps its frames: calibrating in motion at 30 Hz needs stamps good to 0.2 ms"
-    )
+    remedy = "calibrate with --settled (move, settle, then grab); continuous 30 Hz needs stamps good to 0.2 ms"
     if frame.t_source != "device":
         found.warn(
             f"the capture time is not known, only the arrival: {stated} stated; nor can freshness be proven, "

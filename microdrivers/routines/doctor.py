@@ -156,7 +156,7 @@ def _check_time(device: Device[Any], sample: Sample, found: DeviceDiagnosis) -> 
     found.figures |= {"t_source": sample.t_source, "stated_uncertainty_ms": sample.dt_ns / NS_PER_MS}
     what = f"its time is stated to ±{sample.dt_ns / NS_PER_MS:.3g} ms ({sample.t_source})"
     if isinstance(device, XYThetaStage):
-        remedy = "a controller on a serial port, or a faster line, helps: its request then tells when it was latched"
+        remedy = "calibrate with --settled; a faster line or a controller on a serial port helps"
         found.judge(sample.dt_ns <= STAMP_LIMIT_NS, what, remedy)
     else:
         found.ok(what)

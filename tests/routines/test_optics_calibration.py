@@ -196,3 +196,35 @@ def test_an_unreferenced_stage_on_hardware_is_not_referenced_but_named(calibrate
         calibrate()
     assert "microdrivers reference" in caught.value.remedy
     assert "--axes x,y,theta" in caught.value.remedy
+
+
+def test_at_rest_the_calibration_needs_no_time_stamps(calibrate):
+    """A camera that cannot tell the time makes the routine take frames at rest, by itself, and as exactly."""
+
+    class NoStamps(SourceCamera):
+        def _take(self, raw):
+            super()._take(msgspec.structs.replace(raw, t_ns=None))
+
+    steps = []
+
+    class Steps:
+        def step(self, text):
+            steps.append(text)
+
+        def count(self, done, total):
+            pass
+
+    calibration = calibrate(drivers={"camera_fine": NoStamps}, frames=70, progress=Steps())
+    assert any("taking frames at rest" in text for text in steps)
+    assert problems(calibration) == set()
+    assert calibration.result.zoom_change.zoom_after == pytest.approx(1.2, rel=1e-3)
+
+
+def test_in_motion_may_be_insisted_on_and_its_uncertainty_says_what_it_costs(calibrate):
+    class NoStamps(SourceCamera):
+        def _take(self, raw):
+            super()._take(msgspec.structs.replace(raw, t_ns=None))
+
+    calibration = calibrate(drivers={"camera_fine": NoStamps}, settled=False)
+    assert abs(calibration.truth.errors["angle_deg"]) > 0.03
+    assert abs(calibration.truth.errors["angle_deg"]) < 3 * calibration.result.angle_sigma_deg

@@ -28,6 +28,8 @@ from microdrivers.results.optics import (
 from microdrivers.routines.optics.source import Optics, OpticsSource
 from microdrivers.routines.progress import Progress, SilentProgress
 
+ZOOM_STILL = 1e-3
+"""Relative change of zoom from frame to frame that counts as a zoom change."""
 LARGEST_SCALE_UNCERTAINTY = 0.05
 """A calibration whose scale is known no better than this (95 %, relative) is refused."""
 
@@ -176,13 +178,16 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
 
 
 def zoom_change(estimates: Sequence[OpticsEstimate]) -> ZoomChange | None:
-    """How the last zoom change of a run settled; None if the zoom rested throughout."""
-    moving = [index for index, estimate in enumerate(estimates) if estimate.zoom_moving]
-    if not moving:
+    """How the last zoom change of a run settled; None if the zoom rested throughout.
+
+    Where the zoom moved between two frames, no frame was exposed meanwhile: the first frame is the one after.
+    """
+    first = max((i for i in range(1, len(estimates)) if _begins_change(estimates[i - 1], estimates[i])), default=None)
+    if first is None:
         return None
-    last = first = moving[-1]
-    while first > 0 and estimates[first - 1].zoom_moving:
-        first -= 1
+    last = first - 1
+    while last + 1 < len(estimates) and estimates[last + 1].zoom_moving:
+        last += 1
     prior = _trace([estimate.prediction_error_px for estimate in estimates])
     posterior = _trace([estimate.posterior_error_px for estimate in estimates])
     return ZoomChange(
@@ -195,6 +200,12 @@ def zoom_change(estimates: Sequence[OpticsEstimate]) -> ZoomChange | None:
         posterior_iterations_to_0p1_px=iterations_to_settle(posterior, first_frame=first),
         posterior_iterations_to_0p1_px_from_end=iterations_to_settle(posterior, first_frame=last + 1),
     )
+
+
+def _begins_change(before: OpticsEstimate, now: OpticsEstimate) -> bool:
+    if now.zoom_moving:
+        return not before.zoom_moving
+    return not before.zoom_moving and abs(now.zoom - before.zoom) > ZOOM_STILL * before.zoom
 
 
 def _final_estimate(run: OpticsRun) -> OpticsEstimate:
