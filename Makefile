@@ -26,7 +26,7 @@ demo: $(READY)
 	$(BIN)/microdrivers calibrate optics --seed $(SEED) --out $(OUT)
 
 test: $(READY)
-	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
 
 check: $(READY)
 	$(BIN)/ruff check .

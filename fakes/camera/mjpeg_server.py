@@ -94,6 +94,7 @@ class MjpegServer:
         http, self._http = self._http, None
         if http is None or self._thread is None:
             return
+        self._sensor.plugged = False
         self._sensor.cut()
         http.shutdown()
         self._thread.cancel()
@@ -176,9 +177,8 @@ class _Sensor:
                     self.source.stop()
 
     def cut(self) -> None:
-        """Drop all viewers, let nobody join, and wait until they have ended."""
+        """Drop all viewers, and wait until they have ended."""
         with self._lock:
-            self.plugged = False
             viewers = tuple(self._viewers)
         for viewer in viewers:
             viewer.cut = True
@@ -192,12 +192,11 @@ class _Sensor:
 
     def _show(self, run: int, raw: RawFrame) -> None:
         with self._lock:
-            if run != self._run:  # a late frame of earlier settings
-                return
             codings = {viewer.coding for viewer in self._viewers}
         parts = {coding: write_part(raw, coding) for coding in codings}
         with self._lock:
             for viewer in self._viewers:
+                # A late frame may have earlier settings, or come after its successor.
                 if run == self._run and viewer.coding in parts and raw.frame_id > viewer.frame_id:
                     viewer.part, viewer.frame_id = parts[viewer.coding], raw.frame_id
                     viewer.news.set()

@@ -16,7 +16,7 @@ from microdrivers.devices.frame_sources import register_frame_source
 from microdrivers.fakes.world.microscope_world import MicroscopeWorld, check_world
 from microdrivers.fakes.world.scene import Renderer
 
-_LATE_FRAMES = 8
+_LATE_FRAMES = 5
 _UNPLUGGED = "check its cable and power, then close and open it again"
 
 _sources: dict[str, FakeFrameSource] = {}

@@ -10,6 +10,9 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.errors import LinkLost, UnsupportedError
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 
 def camera_on(source, *, size=(64, 48), clock=None, **settings):
     rig = CameraDeviceSettings(source=source, sensor_size_px=size, pixel_pitch_um=5.0, **settings)

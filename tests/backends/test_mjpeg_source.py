@@ -14,6 +14,9 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.errors import LinkLost, LinkTimeout, ProtocolError, UnsupportedError
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 BOUNDARY = "multipart/x-mixed-replace; boundary=here"
 
 

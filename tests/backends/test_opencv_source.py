@@ -21,6 +21,9 @@ from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.errors import BusyError, LinkLost, LinkTimeout, UnsupportedError
 from microdrivers.devices.frame_sources import find_frame_source
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 YUYV = cv2.VideoWriter.fourcc(*"YUYV")
 GREY = cv2.VideoWriter.fourcc(*"GREY")
 

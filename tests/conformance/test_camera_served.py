@@ -6,6 +6,9 @@ from microdrivers.core.errors import LinkLost, ProtocolError
 from tests.conformance.camera_suite import SUITE
 from tests.conformance.served_camera import served_camera
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 
 @pytest.mark.parametrize("name", SUITE.checks)
 def test_source_camera_over_http(name):

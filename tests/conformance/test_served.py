@@ -6,6 +6,9 @@ from microdrivers.core.errors import LinkLost
 from tests.conformance import stage_suite, zoom_suite
 from tests.conformance.bench import served, served_stage_bench, served_zoom_bench
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 STAGE, ZOOM = stage_suite.SUITE.checks, zoom_suite.SUITE.checks
 
 

@@ -6,6 +6,9 @@ import pytest
 
 from microdrivers.core.clock import SystemClock
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 
 @pytest.fixture
 def clock():
@@ -44,14 +47,16 @@ def test_an_error_in_a_callback_is_raised_in_the_main_program(clock):
 
 
 def test_a_callback_may_cancel_itself(clock):
-    calls, done = [], clock.event()
+    calls, timers, known, done = [], [], clock.event(), clock.event()
 
     def once():
+        known.wait(2.0)
         calls.append(1)
-        timer.cancel()
+        timers[0].cancel()
         done.set()
 
-    timer = clock.every(0.001, once, start_ns=clock.now_ns() + 5_000_000)
+    timers.append(clock.every(0.001, once))
+    known.set()
     assert done.wait(2.0)
     clock.sleep(0.02)
     assert calls == [1]

@@ -21,6 +21,9 @@ from microdrivers.fakes.camera.stream_format import CODINGS
 from microdrivers.fakes.world import WORLD
 from microdrivers.fakes.world.settings import WorldSettings
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 SETTINGS = CameraSettings(
     exposure_ms=2.0, gain=1.0, rate_hz=50.0, roi=(0, 0, 160, 120), binning=1, pixel_format="mono8"
 )
@@ -239,7 +242,7 @@ def test_unplugging_ends_the_streams_and_plugging_in_brings_the_same_address_bac
             client.part()
 
 
-def test_a_sensor_that_is_disconnected_ends_the_streams_and_refuses_new_ones():
+def test_a_sensor_that_is_disconnected_ends_the_streams_and_refuses_new_ones_until_it_is_back():
     with serving() as server:
         with Client(server) as client:
             client.part()
@@ -248,6 +251,9 @@ def test_a_sensor_that_is_disconnected_ends_the_streams_and_refuses_new_ones():
                 pass
         with Client(server) as client:
             assert client.response.status == 503
+        server._sensor.source.connected = True
+        with Client(server) as client:
+            client.part()
 
 
 def test_opencv_reads_the_stream():

@@ -12,6 +12,9 @@ import pytest
 
 from tests.conformance.bench import served
 
+# One after the other: they run in real time.
+pytestmark = pytest.mark.xdist_group("real_time")
+
 PIPYTHON = """
     from pipython import GCSDevice, pitools, GCSError
     from pipython.pidevice.interfaces.piserial import PISerial
