@@ -113,12 +113,12 @@ def _on_rig(
     with open_rig(rig_file or shipped_rig(), fake=fake, seed=seed, clock=clock, world=world) as rig:
         settings = CircleSettings(**circle)
         provenance = {
-            "source": "live rig" if not fake else "emulated rig",
+            "source": "emulated rig" if fake else "emulated rig on ports" if rig.file.emulated else "live rig",
             "clock": "simulated" if clock.simulated else "system",
             "rig_name": rig.file.name,
             "rig_file": str(rig.description.file),
             "rig": rig.description.as_data(),
-            "fake": fake,
+            "fake": fake or rig.file.emulated,
             "seed": seed if fake else None,
             "devices": {name: _info(device) for name, device in rig.devices.items()},
             "settings": dict(settings._asdict()),

@@ -54,11 +54,16 @@ class MicroscopeSection(DeviceSettings):
 
 
 class RigFile(DeviceSettings):
-    """The whole file; each device's section is checked by its driver's own model."""
+    """The whole file; each device's section is checked by its driver's own model.
+
+    `emulated` says that emulators stand behind the ports, as in a rig file that `microdrivers serve` writes: results
+    are then marked as simulated.
+    """
 
     schema_version: Literal[1]
     name: str = pydantic.Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")
     description: str = ""
+    emulated: bool = False
     frames: Frames
     microscope: MicroscopeSection | None = None
     devices: dict[DeviceName, dict[str, Any]] = pydantic.Field(min_length=1)

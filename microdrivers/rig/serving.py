@@ -55,7 +55,7 @@ class ServedRig:
 
     def rig_data(self) -> dict[str, Any]:
         """The rig as plain data, pointing at the endpoints."""
-        data = self.description.as_data()
+        data = self.description.as_data() | {"emulated": True}
         for name, endpoint in self.endpoints.items():
             data["devices"][name] = merge_settings(data["devices"][name], _plain(endpoint.overrides))
         return data

@@ -86,3 +86,9 @@ def test_both_wires_carry_the_same_requests(tmp_path):
     assert [line for data in on_port for line in data.split(b"\n") if line.startswith(b"MOV")] == [
         line for data in in_process for line in data.split(b"\n") if line.startswith(b"MOV")
     ]
+
+
+def test_a_served_rig_file_says_that_emulators_stand_behind_its_ports():
+    with served("pty", "zoom") as (rig, _):
+        assert rig.file.emulated
+        assert not rig.fake
