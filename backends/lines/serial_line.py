@@ -123,7 +123,11 @@ class SerialLine:
             start_ns = self.clock.now_ns()
             self._write(request)
             request_end_ns = start_ns + len(request) * self._byte_ns
-            exchange = self._read_reply(request, complete, start_ns, request_end_ns, wait_ns)
+            try:
+                exchange = self._read_reply(request, complete, start_ns, request_end_ns, wait_ns)
+            except BaseException:
+                self._suspect = True  # also when interrupted: the reply may still be coming
+                raise
             self._free_at_ns = exchange.end_ns + self._gap_ns
             self.counters.exchanges += 1
             return exchange

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import pydantic
 
 from microdrivers.devices.drivers import DeviceSettings
+
+
+def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+    if not 0 <= pair[0] <= pair[1]:
+        raise ValueError(f"a range is [smaller, larger], neither negative, not {list(pair)}")
+    return pair
+
+
+_Pair = Annotated[tuple[float, float], pydantic.AfterValidator(_rising)]
 
 
 class StageWorld(DeviceSettings):
@@ -28,7 +37,7 @@ class ZoomWorld(DeviceSettings):
 
     lost_motion_steps: float = pydantic.Field(default=8.0, ge=0)
     servo_lag_ms: float = pydantic.Field(default=1.0, gt=0)
-    start_zoom: tuple[float, float] = (0.8, 1.1)
+    start_zoom: _Pair = (0.8, 1.1)
     curve_spread: float = pydantic.Field(default=0.003, ge=0)
 
 
@@ -47,7 +56,7 @@ class CameraWorld(DeviceSettings):
     sheet says of it, the half-width of the 95 % interval.
     """
 
-    delivery_ms: tuple[float, float] = (6.0, 18.0)
+    delivery_ms: _Pair = (6.0, 18.0)
     delivery_jitter_ms: float = pydantic.Field(default=1.0, ge=0)
     stamp_spread_ms: float = pydantic.Field(default=0.051, ge=0)
     stamp_jitter_ms: float = pydantic.Field(default=0.005, ge=0)
@@ -59,10 +68,10 @@ class TargetWorld(DeviceSettings):
 
     side_um: float = pydantic.Field(default=400.0, gt=0)
     offset_um: float = pydantic.Field(default=450.0, ge=0)
-    background_levels: tuple[float, float] = (90.0, 130.0)
-    contrast_levels: tuple[float, float] = (100.0, 120.0)
+    background_levels: _Pair = (90.0, 130.0)
+    contrast_levels: _Pair = (100.0, 120.0)
     polarity: Literal["drawn", "dark", "bright"] = "drawn"
-    blur_px: tuple[float, float] = (1.0, 1.5)
+    blur_px: _Pair = (1.0, 1.5)
     noise_levels: float = pydantic.Field(default=2.0, ge=0)
     gradient_levels: float = pydantic.Field(default=6.0, ge=0)
     specks: int = pydantic.Field(default=12, ge=0, le=500)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -143,6 +144,7 @@ def _run(
     from microdrivers.routines.optics.calibration import build_result
     from microdrivers.routines.provenance import describe_run
 
+    folder = _prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics")
     truth = OpticsTruthCollector(source.bus)
     run = calibrate_optics(source, progress=progress)
     if not run.estimates and not run.complete:
@@ -152,7 +154,6 @@ def _run(
     command = shlex.join(["microdrivers", *sys.argv[1:]])
     result = build_result(run, describe_run(known, command=command, now=utc_now()))
     result = result.model_copy(update={"truth": truth.compare(result, run.estimates)})
-    folder = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics"
     folder.mkdir(parents=True, exist_ok=True)
     result.write_json(folder / "result.json")
     result.write_calibration(folder / "calibration.yaml")
@@ -165,3 +166,21 @@ def _run(
         click.echo(optics_summary(result))
         click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html")
     return run.complete
+
+
+def _prepare_folder(folder: Path) -> Path:
+    """Find out before the experiment whether its result can be written."""
+    from microdrivers.core.errors import ConfigError
+
+    existed = folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        if not existed:
+            folder.rmdir()  # a failed run leaves nothing behind
+    except OSError as error:
+        raise ConfigError(
+            f"nothing can be written there: {error.strerror}", file=str(folder), remedy="choose another --out folder"
+        ) from error
+    return folder

@@ -58,8 +58,10 @@ def main(debug: bool) -> None:
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    """Being terminated is to stop the stages just as Ctrl-C does."""
-    raise KeyboardInterrupt
+    """Ctrl-C and being terminated: stop the stages, at the next clean moment; a second signal does not wait for it."""
+    from microdrivers.core.clock.interruption import INTERRUPTION
+
+    INTERRUPTION.request()
 
 
 def _add(group: click.Group, name: str, module: str, attribute: str, short_help: str) -> None:

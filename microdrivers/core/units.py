@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import NamedTuple
 
 from microdrivers.core.errors import OutOfRange
@@ -42,6 +43,9 @@ def check_range(value: float, limits: Range, *, what: str, unit: str, device: st
     Raises:
         OutOfRange: it is not; the message names the value, the limits and the unit. Nothing is ever clipped.
     """
+    given: object = value  # callers from notebooks have no type checker
+    if isinstance(given, bool) or not isinstance(given, Real):
+        raise OutOfRange(f"{what} is {value!r}, not a number", device=device, remedy=f"give {what} in {unit}")
     if not math.isfinite(value):
         raise OutOfRange(f"{what} is {value}, not a finite number", device=device, remedy=f"give {what} in {unit}")
     if value not in limits:

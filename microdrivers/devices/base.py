@@ -14,9 +14,11 @@ from microdrivers.core.bus import Bus, Topic
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import DeviceFault, LinkError, LinkLost, MicrodriversError, StaleData
 from microdrivers.core.samples import DeviceEvent, EventKind, SampleT
-from microdrivers.core.units import NS_PER_S
+from microdrivers.core.units import NS_PER_S, Range, check_range
 
 LinkState = Literal["closed", "open", "lost"]
+
+STREAM_RATES_HZ = Range(0.001, 100_000.0)
 
 _log = logging.getLogger(__name__)
 
@@ -149,6 +151,7 @@ class Device(ABC, Generic[SampleT]):
     def stream(self, rate_hz: float) -> Iterator[None]:
         """Publish samples at `rate_hz` on topic `<name>` while the context is open."""
         self._require_open()
+        check_range(rate_hz, STREAM_RATES_HZ, what="stream rate", unit="Hz", device=self.name)
         self._stream_rate_hz = rate_hz
         timer = self.clock.every(1.0 / rate_hz, self._poll, name=f"{self.name} stream")
         try:

@@ -19,6 +19,7 @@ from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
 from microdrivers.core.units import seconds_to_ns
 
+_LARGEST_NUMBER = 1e9
 COLUMNS = ("file", "time_s", "x_um", "y_um", "zoom")
 ZOOM_STEPS_PER_UNIT = 10_000
 """A sequence has no motor: positions are given as zoom in these units."""
@@ -111,14 +112,25 @@ class ImageSequence:
 
 
 def _read_rows(folder: Path) -> list[SequenceRow]:
+    try:
+        return _parse_table(folder)
+    except (UnicodeDecodeError, csv.Error, OSError) as error:
+        raise ConfigError(
+            f"cannot be read as a table: {error}", file=str(folder / "frames.csv"), remedy="save it as CSV in UTF-8"
+        ) from error
+
+
+def _parse_table(folder: Path) -> list[SequenceRow]:
     table = folder / "frames.csv"
+    if not folder.is_dir():
+        raise ConfigError("there is no such folder", file=str(folder), remedy="check the path")
     if not table.is_file():
         raise ConfigError(
             "an image sequence needs a frames.csv",
             file=str(folder), remedy=f"add frames.csv with the columns {', '.join(COLUMNS)}",
         )  # fmt: skip
     rows: list[SequenceRow] = []
-    with table.open(encoding="utf-8", newline="") as stream:
+    with table.open(encoding="utf-8-sig", newline="") as stream:
         header: list[str] | None = None
         for number, cells in enumerate(csv.reader(stream), start=1):
             if not cells or cells[0].lstrip().startswith("#"):
@@ -162,9 +174,11 @@ def _parse_row(folder: Path, line: int, header: list[str], cells: list[str]) -> 
             numbers[key] = float(cell[key])
         except ValueError:
             numbers[key] = math.nan
-        if not math.isfinite(numbers[key]):
+        if not abs(numbers[key]) < _LARGEST_NUMBER or (key == "zoom" and numbers[key] <= 0):
+            above = " above zero" if key == "zoom" else ""
             raise ConfigError(
-                f"{cell[key]!r} is not a finite number", file=table, line=line, column=header.index(key) + 1, key=key,
+                f"{cell[key]!r} is not a finite number{above}", file=table, line=line,
+                column=header.index(key) + 1, key=key,
                 remedy="write a plain number in the unit that the column's name states",
             )  # fmt: skip
     image = folder / cell["file"].strip()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.samples import OpticsEstimate, OpticsTruth
 from microdrivers.results.optics import OpticsResult, Truth
+
+_FEWEST_POSES = 4
 
 Array = npt.NDArray[np.float64]
 
@@ -27,9 +31,9 @@ class OpticsTruthCollector:
         """
         if not self.samples or not estimates:
             return None
-        change = result.zoom_change
-        resting = estimates[change.last_moving_frame + 1 :] if change else estimates
-        resting = resting or estimates[-1:]
+        resting = _at_the_zoom_of(result, estimates)
+        if len(resting) < _FEWEST_POSES:
+            return None
         truths = self._matching(resting)
         corner = _tracked_corner(resting, truths)
         projection = _fit([(t.x_um, t.y_um) for t in truths], [_corner(t, corner) for t in truths])
@@ -59,6 +63,12 @@ class OpticsTruthCollector:
         """The truth of each estimate's frame: the nearest in time, since a camera's stamps are a little off."""
         times = np.array([truth.t_ns for truth in self.samples])
         return [self.samples[int(np.argmin(np.abs(times - estimate.t_ns)))] for estimate in estimates]
+
+
+def _at_the_zoom_of(result: OpticsResult, estimates: list[OpticsEstimate]) -> list[OpticsEstimate]:
+    """The frames that belong to the result: those at its zoom, at rest, after the last change."""
+    first = result.zoom_change.last_moving_frame + 1 if result.zoom_change else 0
+    return [e for e in estimates[first:] if not e.zoom_moving and math.isclose(e.zoom, result.zoom, rel_tol=1e-3)]
 
 
 def _corner(truth: OpticsTruth, corner: int) -> tuple[float, float]:

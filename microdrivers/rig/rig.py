@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SystemClock
+from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.errors import ConnectError, ErrorTree, MicrodriversError, UnsupportedError
 from microdrivers.devices.base import Device
 from microdrivers.rig.rig_file import RigDescription, RigFile, load_rig_file
@@ -111,9 +112,11 @@ class Rig:
         self.clock.close()
 
     def __enter__(self) -> Rig:
+        INTERRUPTION.rig_opened()
         try:
             self.open()
-        except KeyboardInterrupt:
+        except BaseException:
+            INTERRUPTION.rig_closed()
             self.close()
             raise
         return self
@@ -121,7 +124,10 @@ class Rig:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        finally:
+            INTERRUPTION.rig_closed()
 
 
 def build_rig(

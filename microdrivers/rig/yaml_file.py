@@ -61,6 +61,20 @@ for _tag, _pattern, _first in (
     _CoreLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
 
 
+def _integer(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
+    return int(loader.construct_scalar(node), 10)
+
+
+def _float(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> float:
+    text = loader.construct_scalar(node)
+    sign, digits = ("-", text[1:]) if text.startswith("-") else ("", text.removeprefix("+"))
+    return float(sign + (digits[1:] if digits.lower() in (".inf", ".nan") else digits))
+
+
+_CoreLoader.add_constructor("tag:yaml.org,2002:int", _integer)
+_CoreLoader.add_constructor("tag:yaml.org,2002:float", _float)
+
+
 def read_document(file: Path) -> Document:
     """Read a YAML file.
 
@@ -83,6 +97,11 @@ def read_document(file: Path) -> Document:
             f"not valid YAML: {problem}",
             file=str(file), line=place.line, column=place.column,
             remedy="check indentation, colons and quotes around that place",
+        ) from error  # fmt: skip
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
+        raise ConfigError(
+            f"not a plain YAML file: {error}", file=str(file), line=1, column=1,
+            remedy="write plain values: no tags (!!…), no references (&…, *…)",
         ) from error  # fmt: skip
 
 

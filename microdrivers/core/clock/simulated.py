@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from microdrivers.core.clock.base import Clock, ClockError, ClockEvent, Timer
+from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.units import seconds_to_ns
 
 
@@ -114,11 +115,13 @@ class SimulatedClock(Clock):
         heapq.heappush(self._queue, (max(t_ns, self._global_ns), next(self._numbers), call))
 
     def _dispatch_until(self, t_ns: int) -> None:
+        INTERRUPTION.check()
         while self._queue and self._queue[0][0] <= t_ns:
             self._dispatch_next()
         self._global_ns = max(self._global_ns, t_ns)
 
     def _dispatch_next(self) -> None:
+        INTERRUPTION.check()
         due_ns, _, pending = heapq.heappop(self._queue)
         if pending.cancelled:
             return

@@ -9,9 +9,12 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from microdrivers.core.clock.base import Clock, ClockError, ClockEvent, Timer
+from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.units import NS_PER_S, seconds_to_ns
 
 _log = logging.getLogger(__name__)
+
+_JOIN_S = 5.0
 
 
 class SystemClock(Clock):
@@ -32,11 +35,12 @@ class SystemClock(Clock):
         return time.monotonic_ns()
 
     def sleep_until(self, t_ns: int) -> None:
-        if threading.get_ident() == self._owner:
-            self.check()
-        remaining_ns = t_ns - time.monotonic_ns()
-        if remaining_ns > 0:
-            time.sleep(remaining_ns / NS_PER_S)
+        if threading.get_ident() != self._owner:
+            _sleep_until(t_ns)
+            return
+        self.check()
+        with INTERRUPTION.waiting():
+            _sleep_until(t_ns)
 
     def call_at(self, t_ns: int, call: Callable[[], object], *, name: str = "") -> Timer:
         return self._start(_Source(self, t_ns, 0, call, name))
@@ -108,7 +112,9 @@ class _Source(threading.Thread):
     def cancel(self) -> None:
         self._cancelled.set()
         if self.is_alive() and threading.current_thread() is not self:
-            self.join()
+            self.join(_JOIN_S)
+            if self.is_alive():
+                _log.error("%s does not end; it is left behind", self.name)
 
 
 class _SystemEvent:
@@ -125,4 +131,13 @@ class _SystemEvent:
         self._event.clear()
 
     def wait(self, timeout_s: float) -> bool:
-        return self._event.wait(timeout_s)
+        if threading.current_thread() is not threading.main_thread():
+            return self._event.wait(timeout_s)
+        with INTERRUPTION.waiting():
+            return self._event.wait(timeout_s)
+
+
+def _sleep_until(t_ns: int) -> None:
+    remaining_ns = t_ns - time.monotonic_ns()
+    if remaining_ns > 0:
+        time.sleep(remaining_ns / NS_PER_S)

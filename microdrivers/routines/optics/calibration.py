@@ -12,7 +12,7 @@ from microdrivers.core.errors import IllConditioned
 from microdrivers.core.inbox import EstimatorHost
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
 from microdrivers.core.units import NS_PER_S
-from microdrivers.estimators.optics import OpticalParameters, optical_parameters
+from microdrivers.estimators.optics import OpticalParameters, optical_parameters, student_factor
 from microdrivers.estimators.optics.calibrator import CalibratorSettings, OpticsCalibrator, PointTracker
 from microdrivers.results.optics import (
     OpticsResult,
@@ -127,6 +127,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         IllConditioned: the run does not determine a calibration; the message says what was missing.
     """
     final = _final_estimate(run)
+    outdated = any(_begins_change(final, later) for later in run.estimates[final.frame_index + 1 :])
     covariance = np.array(final.covariance).reshape(6, 6)
     parameters = optical_parameters(
         final.projection,
@@ -134,12 +135,12 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         degrees_of_freedom=final.degrees_of_freedom,
         pixel_pitch_um=run.optics.pixel_pitch_um,
     )
-    _check_determined(parameters, run)
+    _check_determined(parameters, run, final.degrees_of_freedom)
     p = final.projection
     pitch_um = run.optics.pixel_pitch_um
     scales = _trace([e.scale_px_per_um for e in run.estimates])
     return OpticsResult(
-        complete=run.complete,
+        complete=run.complete and not outdated,
         projection=(p[:3], p[3:]),
         scale_px_per_um=parameters.scale_px_per_um,
         scale_sigma_px_per_um=parameters.sigma_scale_px_per_um or 0.0,
@@ -159,7 +160,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         prediction_error_px=_trace([e.prediction_error_px for e in run.estimates]),
         posterior_error_px=_trace([e.posterior_error_px for e in run.estimates]),
         magnification_trace=[None if s is None or pitch_um is None else s * pitch_um for s in scales],
-        zoom_change=zoom_change(run.estimates),
+        zoom_change=None if outdated else zoom_change(run.estimates),
         frames=len(run.estimates),
         lost_frames=run.lost_frames,
         unmatched_frames=run.unmatched_frames,
@@ -171,7 +172,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
             zoom=final.zoom,
         ),
         traces=_traces(run.estimates, scales),
-        notes=_notes(run),
+        notes=_notes(run, outdated_at=final.zoom if outdated else None),
         provenance=provenance,
         truth=truth,
     )
@@ -219,16 +220,17 @@ def _final_estimate(run: OpticsRun) -> OpticsEstimate:
     )
 
 
-def _check_determined(parameters: OpticalParameters, run: OpticsRun) -> None:
+def _check_determined(parameters: OpticalParameters, run: OpticsRun, degrees_of_freedom: float) -> None:
     sigma = parameters.sigma_scale_px_per_um
-    relative = math.inf if sigma is None else 1.96 * sigma / parameters.scale_px_per_um
+    factor = student_factor(degrees_of_freedom)
+    relative = math.inf if sigma is None else factor * sigma / parameters.scale_px_per_um
     if not relative <= LARGEST_SCALE_UNCERTAINTY:
         x_um = [estimate.x_um for estimate in run.estimates]
         y_um = [estimate.y_um for estimate in run.estimates]
         raise IllConditioned(
-            f"the scale would be uncertain by {100 * relative:.0f} %: the stage moved over only "
+            f"{len(run.estimates)} frames leave the scale uncertain by {100 * relative:.0f} %: the stage moved over "
             f"{max(x_um) - min(x_um):.3g} × {max(y_um) - min(y_um):.3g} µm",
-            remedy="move further, and along both axes: a circle that fills the view is best",
+            remedy="take more frames, and move further and along both axes: a circle that fills the view is best",
         )
 
 
@@ -253,8 +255,13 @@ def _traces(estimates: Sequence[OpticsEstimate], scales: Trace) -> Traces:
     )
 
 
-def _notes(run: OpticsRun) -> list[str]:
+def _notes(run: OpticsRun, outdated_at: float | None) -> list[str]:
     notes = []
+    if outdated_at is not None:
+        notes.append(
+            f"The run ended before the calibration had settled after the zoom change: this is the calibration at zoom "
+            f"{outdated_at:.4g}, and the zoom now reads {run.estimates[-1].zoom:.4g}."
+        )
     if not run.complete:
         notes.append("The run was interrupted; the result holds what had been measured until then.")
     if run.lost_frames:

@@ -18,7 +18,7 @@ from microdrivers.core.errors import (
     UnsupportedError,
 )
 from microdrivers.core.samples import Frame, TrackedPoint
-from microdrivers.core.units import NS_PER_MS, Range, check_range
+from microdrivers.core.units import NS_PER_MS, NS_PER_S, Range, check_range
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
@@ -42,6 +42,10 @@ LARGEST_TIME_UNCERTAINTY_NS = 200_000
 """Half-width (95 %) of the time between pose and frame up to which frames are taken in motion: 0.2 ms are 0.024°."""
 _SMALLEST_RADIUS_UM = 50.0
 _LARGEST_RADIUS_UM = 10_000.0
+_FRAMES_TO_SETTLE = 12
+_TIMED_READS = 5
+_POSES_PER_FRAME = 3.0
+"""Poses for each frame in motion: fewer, and the line between two of them cuts the circle's corner."""
 _PAPER_RADIUS_UM = 300.0
 _SCALE_TRUST = 2.0
 """The observed scale may differ from objective × zoom by this factor before units are suspected."""
@@ -119,6 +123,12 @@ class CircleExperiment:
         if asked.radius_um is not None:
             what = "radius of the circle"
             check_range(asked.radius_um, Range(_SMALLEST_RADIUS_UM, _LARGEST_RADIUS_UM), what=what, unit="µm")
+        needed = asked.change_after_frame + 1 + _FRAMES_TO_SETTLE
+        if asked.zoom_to != asked.zoom_from and asked.frames < needed:
+            raise OutOfRange(
+                f"{asked.frames} frames end before the calibration can settle after the zoom change",
+                remedy=f"take at least {needed} frames, or stay at one zoom: --zoom-from Z --zoom-to Z",
+            )
         for name, zoom in (("zoom before the change", asked.zoom_from), ("zoom after the change", asked.zoom_to)):
             check_range(zoom, self._zoom.zoom_range, what=name, unit="x", device=self._zoom.name)
 
@@ -253,12 +263,26 @@ class CircleExperiment:
     def _drive(self, circle: Circle, frame: Frame, begin: Callable[[], None], progress: Progress) -> None:
         """In motion if times are known well enough for that, else at rest."""
         devices = Instruments(self._stage, self._zoom, self._camera, self.clock)
-        known_to_ns = math.hypot(frame.dt_ns, self._stage.read().dt_ns)
-        if self.settings.settled is None and known_to_ns > LARGEST_TIME_UNCERTAINTY_NS:
+        why = "" if self.settings.settled is not None else self._unfit_for_motion(frame)
+        if why:
             self._settled = True
-            progress.step(
-                f"pose against frame is known to ±{known_to_ns / NS_PER_MS:.2g} ms only, and motion needs "
-                f"{LARGEST_TIME_UNCERTAINTY_NS / NS_PER_MS:g} ms: taking frames at rest"
-            )
+            progress.step(f"{why}: taking frames at rest")
         drive = step_along if self._settled else stream_along
         drive(devices, circle, self.settings.pace(), begin, progress)
+
+    def _unfit_for_motion(self, frame: Frame) -> str:
+        """Why frames cannot be taken in motion; empty if they can."""
+        begun_ns = self.clock.now_ns()
+        poses = [self._stage.read() for _ in range(_TIMED_READS)]
+        read_s = (self.clock.now_ns() - begun_ns) / (_TIMED_READS * NS_PER_S)
+        known_to_ns = math.hypot(frame.dt_ns, poses[-1].dt_ns)
+        rate_hz = self._camera.settings.rate_hz
+        if known_to_ns > LARGEST_TIME_UNCERTAINTY_NS:
+            return (
+                f"pose against frame is known to ±{known_to_ns / NS_PER_MS:.2g} ms only, and motion needs "
+                f"{LARGEST_TIME_UNCERTAINTY_NS / NS_PER_MS:g} ms"
+            )
+        if read_s * self.settings.pose_rate_hz > 1.0 or self.settings.pose_rate_hz < _POSES_PER_FRAME * rate_hz:
+            poses_hz = min(1.0 / read_s, self.settings.pose_rate_hz)
+            return f"poses at {poses_hz:.0f} Hz are too few for {rate_hz:g} frames a second"
+        return ""

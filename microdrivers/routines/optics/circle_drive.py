@@ -50,6 +50,11 @@ class Instruments(NamedTuple):
     camera: Camera
     clock: Clock
 
+    def stop(self) -> None:
+        """Nothing moves any more."""
+        self.stage.stop(by="calibration", reason="the way along the circle ended")
+        self.zoom.stop(by="calibration", reason="the way along the circle ended")
+
 
 class Pace(NamedTuple):
     """How the circle is gone along; the zoom changes after frame `change_after_frame`, counted from 0."""
@@ -69,7 +74,10 @@ def fastest_um_s(stage: XYThetaStage) -> float:
 
 def step_along(devices: Instruments, circle: Circle, pace: Pace, begin: Callable[[], None], progress: Progress) -> None:
     """From point to point: move, settle, then grab. Times need not be known better than the stage stands still."""
-    with devices.stage.stream(pace.pose_rate_hz), devices.zoom.stream(pace.zoom_rate_hz):
+    with ExitStack() as stack:
+        stack.enter_context(devices.stage.stream(pace.pose_rate_hz))
+        stack.enter_context(devices.zoom.stream(pace.zoom_rate_hz))
+        stack.callback(devices.stop)
         progress.step("calibrating on the circle, at rest")
         begin()
         for number in range(pace.frames):
@@ -93,6 +101,7 @@ def stream_along(
         arrivals = _Arrivals(devices.camera)
         stack.callback(arrivals.close)
         stack.enter_context(devices.camera.running())
+        stack.callback(devices.stop)  # the last to enter is the first to leave: stop, then wait for threads to end
         arrivals.await_frames(devices.clock, 1)
         pursuit = _Pursuit(devices, circle, pace, arrivals)
         for _ in range(_LEAD_IN_FRAMES):
