@@ -137,6 +137,7 @@ def _run(
     source: OpticsSource, known: dict[str, Any], out: Path | None, as_json: bool, progress: TerminalProgress
 ) -> bool:
     from microdrivers.core.clock import utc_now
+    from microdrivers.core.errors import CalibrationError
     from microdrivers.report.optics_report import write_optics_report
     from microdrivers.report.summary import optics_summary
     from microdrivers.report.truth import OpticsTruthCollector
@@ -152,7 +153,13 @@ def _run(
         return False
     known["settings"] = known.get("settings", {}) | run.settings._asdict()
     command = shlex.join(["microdrivers", *sys.argv[1:]])
-    result = build_result(run, describe_run(known, command=command, now=utc_now()))
+    try:
+        result = build_result(run, describe_run(known, command=command, now=utc_now()))
+    except CalibrationError as error:
+        if run.complete:
+            raise
+        click.echo(f"too little had been measured for a result: {error.what}", err=True)
+        return False
     result = result.model_copy(update={"truth": truth.compare(result, run.estimates)})
     folder.mkdir(parents=True, exist_ok=True)
     result.write_json(folder / "result.json")

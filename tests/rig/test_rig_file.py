@@ -110,3 +110,15 @@ def test_a_missing_file_says_so(tmp_path):
 def test_numbers_are_yaml_1_2(edited):
     file, _ = edited("resolution_um: 0.05", "resolution_um: 5e-2")
     assert load_rig_file(file).devices["sample_stage"].settings.axes.x.resolution_um == 0.05
+
+
+def test_whole_numbers_are_decimal_whatever_their_zeros(edited):
+    file, _ = edited("unit_id: 1", "unit_id: 017")
+    assert load_rig_file(file).devices["zoom"].settings.unit_id == 17
+
+
+@pytest.mark.parametrize("value", ["!!int abc", "!!timestamp foo", "&a [*a]", "!!python/name:os.system"])
+def test_tags_and_references_are_refused_by_place(edited, value):
+    file, _ = edited("unit_id: 1", f"unit_id: {value}")
+    with pytest.raises(ConfigError, match=r"lab\.yaml"):
+        load_rig_file(file)

@@ -228,3 +228,37 @@ def test_in_motion_may_be_insisted_on_and_its_uncertainty_says_what_it_costs(cal
     calibration = calibrate(drivers={"camera_fine": NoStamps}, settled=False)
     assert abs(calibration.truth.errors["angle_deg"]) > 0.03
     assert abs(calibration.truth.errors["angle_deg"]) < 3 * calibration.result.angle_sigma_deg
+
+
+def test_a_scale_that_contradicts_the_optics_is_suspected_to_be_a_wrong_unit(calibrate):
+    def wrong_pitch(rig):
+        rig.devices["camera_fine"].pixel_pitch_um *= 10
+
+    with pytest.raises(CalibrationError, match="shifts the image by"):
+        calibrate(prepare=wrong_pitch)
+
+
+def test_too_few_frames_to_settle_are_refused_before_anything_moves(calibrate):
+    with pytest.raises(OutOfRange, match="end before the calibration can settle"):
+        calibrate(frames=48)
+
+
+def test_a_zoom_too_slow_to_arrive_gives_an_old_calibration_that_says_so(calibrate):
+    def slow(rig):
+        zoom = rig.devices["zoom"]
+        zoom._settings = zoom._settings.model_copy(update={"speed_steps_s": 100})
+        zoom.axis = msgspec.structs.replace(zoom.axis, max_speed=100.0)
+
+    calibration = calibrate(prepare=slow, frames=70)
+    assert not calibration.result.complete
+    assert any("this is the calibration at zoom 0.9" in note for note in calibration.result.notes)
+    assert abs(calibration.truth.errors["scale_percent"]) < 0.1
+
+
+def test_a_frame_rate_that_poses_cannot_follow_is_taken_at_rest(calibrate):
+    def faster(rig):
+        rig.devices["camera_fine"].settings = msgspec.structs.replace(rig.devices["camera_fine"].settings, rate_hz=60.0)
+
+    calibration = calibrate(prepare=faster, frames=60)
+    assert calibration.run.complete
+    assert problems(calibration) == set()
