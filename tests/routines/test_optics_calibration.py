@@ -251,7 +251,7 @@ def test_a_zoom_too_slow_to_arrive_gives_an_old_calibration_that_says_so(calibra
 
     calibration = calibrate(prepare=slow, frames=70)
     assert not calibration.result.complete
-    assert any("this is the calibration at zoom 0.9" in note for note in calibration.result.notes)
+    assert any("this is the calibration at zoom 0.89" in note for note in calibration.result.notes)
     assert abs(calibration.truth.errors["scale_percent"]) < 0.1
 
 
