@@ -57,3 +57,11 @@ def test_while_waiting_it_happens_at_once(interruption):
     interruption.rig_opened()
     with interruption.waiting(), pytest.raises(KeyboardInterrupt):
         interruption.request()
+
+
+def test_one_that_came_too_late_for_a_rig_does_not_meet_the_next(interruption):
+    interruption.rig_opened()
+    interruption.request()
+    interruption.rig_closed()
+    interruption.rig_opened()
+    SimulatedClock().sleep(0.001)

@@ -51,6 +51,7 @@ class Interruption:
         """From now on interruptions are kept until the main program waits."""
         self._rigs_open += 1
         self._signals = 0
+        self._requested = False  # one that came too late for the last rig is not meant for this one
 
     def rig_closed(self) -> None:
         """The end of that."""
