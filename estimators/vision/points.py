@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,24 +13,6 @@ from microdrivers.core.samples import Frame, TrackedPoint
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 _NAN = float("nan")
-
-
-class PointTracker(Protocol):
-    """Frames in, one tracked point a frame out; deterministic in the sequence of frames.
-
-    Attributes:
-        last_reason: why the newest frame gave no point, in words; empty when it did.
-    """
-
-    last_reason: str
-
-    def update(self, frame: Frame) -> TrackedPoint:
-        """Locate the target in `frame`; `found` is False and the coordinates NaN when it is lost."""
-        ...
-
-    def reset(self) -> None:
-        """Forget the target; the next frame starts anew."""
-        ...
 
 
 def require_grey(image: npt.NDArray[Any]) -> GreyImage:
