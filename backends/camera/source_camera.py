@@ -9,7 +9,7 @@ import msgspec
 from microdrivers.backends.camera.settings import CameraDeviceSettings
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import MicrodriversError, UnsupportedError
+from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import Frame
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.base import DeviceInfo
@@ -40,18 +40,18 @@ class SourceCamera(Camera):
             roi=(0, 0, width, height), binning=1, pixel_format="mono8",
         )  # fmt: skip
 
-    def _open(self) -> DeviceInfo:
+    def _connect(self) -> None:
         source = find_frame_source(self._rig.source, self.clock)
         source.open()
-        try:
-            self._check_identity(source)
-            self.settings = source.configure(self.settings)
-            if self._users:  # it was lost and is back while somebody waits for frames
-                source.start(self._take, self._lose)
-        except MicrodriversError:
-            source.close()
-            raise
         self._source = source
+
+    def _identify(self) -> DeviceInfo:
+        source = self._source
+        assert source is not None
+        self._check_identity(source)
+        self.settings = source.configure(self.settings)
+        if self._users:  # it was lost and is back while somebody waits for frames
+            source.start(self._take, self._lose)
         return DeviceInfo(driver="camera", model=source.model, serial_number=source.serial_number)
 
     def _close(self) -> None:

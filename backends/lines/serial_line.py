@@ -21,6 +21,7 @@ from microdrivers.backends.lines.settings import SerialConnection
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import LinkError, LinkLost, LinkTimeout, ProtocolError, UnsupportedError
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
+from microdrivers.devices.wire_tap import WireTap
 
 MAX_REPLY_BYTES = 65536
 _QUIET_S = 0.03
@@ -62,12 +63,16 @@ class SerialLine:
 
     Args:
         gap_s: silence to keep between the end of a reply and the next request.
+        tap: is told everything that passes.
     """
 
-    def __init__(self, connection: SerialConnection, *, clock: Clock, gap_s: float = 0.0) -> None:
+    def __init__(
+        self, connection: SerialConnection, *, clock: Clock, gap_s: float = 0.0, tap: WireTap | None = None
+    ) -> None:
         self.connection = connection
         self.clock = clock
         self.counters = LineCounters()
+        self._tap = tap
         self._gap_ns = seconds_to_ns(gap_s)
         self._byte_ns = round(connection.bits_per_byte * NS_PER_S / connection.baudrate)
         self._lock = threading.Lock()
@@ -252,6 +257,8 @@ class SerialLine:
         self._poller.register(self._descriptor, select.POLLIN)
 
     def _write(self, data: bytes) -> None:
+        if self._tap is not None:
+            self._tap.sent(self.clock.now_ns(), data)
         with self._link():
             self._require_port().write(data)
 
@@ -259,7 +266,7 @@ class SerialLine:
         with self._link():
             port = self._require_port()
             waiting = port.in_waiting
-            return bytes(port.read(waiting)) if waiting else b""
+            return self._heard(bytes(port.read(waiting))) if waiting else b""
 
     def _read_within(self, wait_ns: int) -> bytes:
         """Bytes as soon as there are any, b"" if there are none within `wait_ns`."""
@@ -268,13 +275,18 @@ class SerialLine:
             if self._descriptor is None or self._poller is None:
                 port.timeout = max(wait_ns, 0) / NS_PER_S
                 first = bytes(port.read(1))
-                return first + bytes(port.read(port.in_waiting)) if first else b""
+                return self._heard(first + bytes(port.read(port.in_waiting))) if first else b""
             if not self._poller.poll(max(wait_ns, 0) / NS_PER_MS):
                 return b""
             data = os.read(self._descriptor, 4096)
             if not data:
                 raise OSError(errno.EIO, "the port reports data and delivers none: device disconnected")
-            return data
+            return self._heard(data)
+
+    def _heard(self, data: bytes) -> bytes:
+        if self._tap is not None:
+            self._tap.received(self.clock.now_ns(), data)
+        return data
 
     def _require_port(self) -> Any:
         if self._port is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 from microdrivers.backends.lines.serial_line import SerialLine
 from microdrivers.backends.oriental_az.alarms import alarm_fault
@@ -29,6 +29,7 @@ from microdrivers.core.samples import EventKind, ZoomSample
 from microdrivers.core.units import Range, seconds_to_ns
 from microdrivers.devices.base import DeviceInfo
 from microdrivers.devices.motion import AxisSpec
+from microdrivers.devices.wire_tap import WireTap
 from microdrivers.devices.zoom_motor import Approach, ZoomCurve, ZoomMotor
 
 _POLL_S = 0.02
@@ -63,7 +64,12 @@ class AzZoomMotor(ZoomMotor):
             tolerance=settings.tolerance_steps,
         )
         self._settings = settings
-        self._line = SerialLine(settings.connection, clock=clock, gap_s=rtu_timing(settings.connection.baudrate).gap_s)
+        self._line = SerialLine(
+            settings.connection,
+            clock=clock,
+            gap_s=rtu_timing(settings.connection.baudrate).gap_s,
+            tap=WireTap(name, bus),
+        )
         self._drive = AzDrive(RtuMaster(self._line, unit_id=settings.unit_id))
         self._backlash = Backlash(
             play_steps=settings.backlash_steps,
@@ -88,23 +94,19 @@ class AzZoomMotor(ZoomMotor):
 
     # ------------------------------------------------------------------ connection
 
-    def _open(self) -> DeviceInfo:
-        with ExitStack() as undo:
-            self._line.open()
-            undo.callback(self._line.close)
-            self._begin()
-            self.fault = None
-            self._identify()
-            undo.pop_all()
-        return DeviceInfo(driver="oriental-az-zoom", vendor="Oriental Motor", model="AZ")
+    def _connect(self) -> None:
+        self._line.open()
+        self._begin()
+        self.fault = None
 
-    def _identify(self) -> None:
+    def _identify(self) -> DeviceInfo:
         """Read what an AZ drive must be able to tell; an alarm is recorded and leaves the device open."""
         self._observe()
         self._note_alarm(self._drive.read_alarm())
         error = self._drive.read_communication_error()
         if error:
             _log.info("%s: the drive's latest communication error is %02Xh", self.name, error)
+        return DeviceInfo(driver="oriental-az-zoom", vendor="Oriental Motor", model="AZ")
 
     @property
     def line_counters(self) -> Mapping[str, int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 
 from microdrivers.backends.lines.serial_line import SerialLine
 from microdrivers.backends.pi_gcs import error_codes
@@ -28,6 +27,7 @@ from microdrivers.core.errors import (
 from microdrivers.core.samples import TimeSource, XYThetaSample
 from microdrivers.core.units import NS_PER_MS, seconds_to_ns
 from microdrivers.devices.base import DeviceInfo
+from microdrivers.devices.wire_tap import WireTap
 from microdrivers.devices.xytheta_stage import AXES, XYThetaStage
 
 FAULT_FLAG = "FAULT"
@@ -50,7 +50,7 @@ class GcsXYThetaStage(XYThetaStage):
         super().__init__(name, clock=clock, bus=bus)
         self.settle_s = settings.settle_s
         self._settings = settings
-        self._line = SerialLine(settings.connection, clock=clock)
+        self._line = SerialLine(settings.connection, clock=clock, tap=WireTap(name, bus))
         self._gcs = Gcs(self._line)
         self._latch_delay_ns = round(settings.latch.delay_ms * NS_PER_MS)
         self._latch_dt_ns = round(settings.latch.uncertainty_ms * NS_PER_MS)
@@ -71,18 +71,17 @@ class GcsXYThetaStage(XYThetaStage):
 
     # ------------------------------------------------------------------ life
 
-    def _open(self) -> DeviceInfo:
+    def _connect(self) -> None:
         self._line.open()
-        with ExitStack() as undo:
-            undo.callback(self._line.close)
-            try:
-                found = inspect(self._gcs, self._settings, self._rig_axes, name=self.name)
-                self._adopt(found.axes, found.status_index)
-                self._examine()
-            except MicrodriversError as error:
-                error.moved = "no"
-                raise
-            undo.pop_all()
+
+    def _identify(self) -> DeviceInfo:
+        try:
+            found = inspect(self._gcs, self._settings, self._rig_axes, name=self.name)
+            self._adopt(found.axes, found.status_index)
+            self._examine()
+        except MicrodriversError as error:
+            error.moved = "no"
+            raise
         return found.info
 
     @property

@@ -22,9 +22,10 @@ _POLL_S = 0.05
 
 
 class _Told(NamedTuple):
-    """What became of one device: `error` None means that the stop command was sent."""
+    """What became of one device: whether the stop was sent, and what went wrong before it or after."""
 
     device: Device[Any]
+    sent: bool
     error: MicrodriversError | None
 
 
@@ -50,8 +51,8 @@ def stop(choice: RigChoice) -> None:
         told = _tell_all(rig, moving)
         width = max(map(len, rig.devices))
         failed = False
-        for device, error in told:
-            text, bad = (_unreached(error), True) if error is not None else _watch(device)
+        for device, sent, error in told:
+            text, bad = _watch(device) if error is None else (_failed(sent, error), True)
             failed |= bad
             click.echo(f"{device.name:<{width}}  {text}")
     if failed:
@@ -70,16 +71,20 @@ def _tell_all(rig: Rig, devices: list[Device[Any]]) -> list[_Told]:
 def _tell(device: Device[Any]) -> _Told:
     from microdrivers.core.errors import MicrodriversError
 
+    sent = False
     try:
-        device.open()  # there is no line to send a stop on before
-        device.stop(by="user", reason="microdrivers stop")
+        device.connect()
+        device.stop(by="user", reason="microdrivers stop")  # before anything is asked: whoever listens must stop
+        sent = True
+        device.open()
     except MicrodriversError as error:
-        return _Told(device, error)
-    return _Told(device, None)
+        return _Told(device, sent, error)
+    return _Told(device, sent, None)
 
 
-def _unreached(error: MicrodriversError) -> str:
-    lines = [f"{click.style('NOT REACHED', fg='red', bold=True)}: {error.what}"]
+def _failed(sent: bool, error: MicrodriversError) -> str:
+    outcome = "told to stop, but WHO LISTENS IS NOT KNOWN" if sent else "NOT REACHED"
+    lines = [f"{click.style(outcome, fg='red', bold=True)}: {error.what}"]
     if error.remedy:
         lines.append(f"    to do: {error.remedy}; if another program holds the port, interrupt that program")
     return "\n".join(lines)

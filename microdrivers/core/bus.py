@@ -65,6 +65,11 @@ class Topic(Generic[SampleT]):
         """The newest sample, if any."""
         return self.history[-1] if self.history else None
 
+    @property
+    def heard(self) -> bool:
+        """Whether anybody subscribes: what is costly to make for a log need not be made for nobody."""
+        return bool(self._subscriptions)
+
     def publish(self, sample: SampleT) -> None:
         """Stamp the bus-wide order (once in a sample's life), run the guards, then the subscribers."""
         if sample.order < 0:

@@ -98,6 +98,13 @@ class Frame(Sample, frozen=True, kw_only=True):
     principal_point_px: tuple[float, float]
 
 
+class WireTraffic(Sample, frozen=True, gc=False, kw_only=True):
+    """Bytes that a driver has sent (`direction` "sent") or received; `t_ns` is when it handed them over or got them."""
+
+    direction: Literal["sent", "received"]
+    data: bytes
+
+
 class DeviceEvent(Sample, frozen=True, gc=False, kw_only=True):
     """Something happened to a device; published on `<name>/event`."""
 

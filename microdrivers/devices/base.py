@@ -16,7 +16,8 @@ from microdrivers.core.errors import DeviceFault, LinkError, LinkLost, Microdriv
 from microdrivers.core.samples import DeviceEvent, EventKind, SampleT
 from microdrivers.core.units import NS_PER_S, Range, check_range
 
-LinkState = Literal["closed", "open", "lost"]
+LinkState = Literal["closed", "connected", "open", "lost"]
+"""`connected`: there is a line to send a stop on, but nobody knows yet who listens."""
 
 STREAM_RATES_HZ = Range(0.001, 100_000.0)
 
@@ -36,9 +37,9 @@ class DeviceInfo(msgspec.Struct, frozen=True, kw_only=True):
 class Device(ABC, Generic[SampleT]):
     """Base of all devices.
 
-    A driver supplies the raw actions (`_open`, `_close`, `_stop`, `_read`); the public methods add state, events
-    and checks. `open()` connects and identifies and NEVER moves or tares. `stop()` may be called from any thread,
-    bus callbacks included: it takes no lock and awaits no reply.
+    A driver supplies the raw actions (`_connect`, `_identify`, `_close`, `_stop`, `_read`); the public methods add
+    state, events and checks. `open()` connects and identifies and NEVER moves or tares. `stop()` may be called from any
+    thread, bus callbacks included: it takes no lock and awaits no reply.
     """
 
     sample_type: type[SampleT]
@@ -61,8 +62,12 @@ class Device(ABC, Generic[SampleT]):
     # ------------------------------------------------------------------ what a driver supplies
 
     @abstractmethod
-    def _open(self) -> DeviceInfo:
-        """Connect and identify, without moving anything."""
+    def _connect(self) -> None:
+        """Open the line, so that a stop can be sent; ask nothing."""
+
+    @abstractmethod
+    def _identify(self) -> DeviceInfo:
+        """Find out who answers and adopt its limits, without moving anything."""
 
     @abstractmethod
     def _close(self) -> None:
@@ -81,16 +86,35 @@ class Device(ABC, Generic[SampleT]):
 
     # ------------------------------------------------------------------ public
 
+    def connect(self) -> None:
+        """Open the line and ask nothing: from here on `stop()` works. `open()` completes it.
+
+        Raises:
+            LinkLost: there is no such port, or it is busy or forbidden.
+        """
+        if self.link == "lost":
+            self.close()
+        if self.link == "closed":
+            with self._naming_errors():
+                self._connect()
+            self.link = "connected"
+
     def open(self) -> None:
-        """Connect and identify; nothing moves.
+        """Connect and identify; nothing moves. If it fails the connection is released.
 
         Raises:
             LinkError, DeviceFault, ConfigError: the device does not answer, is another one, or is at fault.
         """
+        self.connect()
         if self.link == "open":
             return
-        with self._naming_errors():
-            self.info = self._open()
+        try:
+            with self._naming_errors():
+                self.info = self._identify()
+        except BaseException:
+            self.link = "closed"
+            self._close()
+            raise
         self.link = "open"
         self._publish_event("opened")
 
