@@ -109,15 +109,13 @@ def _reference_emulated(rig: Rig, stage: XYThetaStage, given: dict[str, float]) 
 
 
 def _move_stage(stage: XYThetaStage, given: dict[str, float], relative: bool) -> str:
-    from microdrivers.devices.xytheta_stage import position_of
     from microdrivers.routines.device_state import state_text
 
     if relative:
         pose = stage.move_by(**{name if "speed" in name else f"d{name}": value for name, value in given.items()})
     else:
         pose = stage.move_to(**given)
-    here = position_of(pose)
-    goal = {"x": pose.target_x_um, "y": pose.target_y_um, "theta": pose.target_theta_deg}
+    here, goal = pose.position, pose.target
     misses = [f"{axis} {here[axis] - goal[axis]:+.3g} {stage.axes[axis].unit}" for axis in _axes(given)]
     return f"{state_text(stage, pose)}; off target by {', '.join(misses)}"
 

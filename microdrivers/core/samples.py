@@ -7,7 +7,8 @@ part of the field names: µm, degrees, µN, px, ms. See docs/decisions/0002.
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeVar
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, TypeVar
 
 import msgspec
 import numpy.typing as npt
@@ -18,7 +19,7 @@ request and reply · arrival at the host (weakest) · a recording · the samples
 
 EventKind = Literal[
     "opened", "closed", "link_lost", "link_back", "fault", "fault_cleared", "reference_found", "reference_lost",
-    "limit", "stopped", "settings_changed",
+    "limit", "stopped", "settings_changed", "tared",
 ]  # fmt: skip
 
 
@@ -47,12 +48,31 @@ class Sample(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 SampleT = TypeVar("SampleT", bound=Sample)
 
 
-class XYThetaSample(Sample, frozen=True, gc=False, kw_only=True):
-    """Pose of an XYθ stage, all three axes at one time.
+class PoseSample(Sample, frozen=True, gc=False, kw_only=True):
+    """Pose of a stage, all axes at one time; `moving`, `on_target` and `referenced` hold for all axes together."""
 
-    `target_*` is the last commanded position (NaN if none); `moving`, `on_target` and `referenced` hold for all
-    axes together.
-    """
+    position_fields: ClassVar[Mapping[str, str]] = {}
+    """Name of each axis, and of the field that holds its position; `target_` before it is the target's."""
+
+    moving: bool
+    on_target: bool
+    referenced: bool
+
+    @property
+    def position(self) -> dict[str, float]:
+        """Position by axis, µm or degrees."""
+        return {axis: getattr(self, field) for axis, field in self.position_fields.items()}
+
+    @property
+    def target(self) -> dict[str, float]:
+        """Last commanded position by axis, µm or degrees; NaN if none."""
+        return {axis: getattr(self, f"target_{field}") for axis, field in self.position_fields.items()}
+
+
+class XYThetaSample(PoseSample, frozen=True, gc=False, kw_only=True):
+    """Pose of an XYθ stage; `target_*` is the last commanded position (NaN if none)."""
+
+    position_fields = {"x": "x_um", "y": "y_um", "theta": "theta_deg"}
 
     x_um: float
     y_um: float
@@ -60,9 +80,31 @@ class XYThetaSample(Sample, frozen=True, gc=False, kw_only=True):
     target_x_um: float = float("nan")
     target_y_um: float = float("nan")
     target_theta_deg: float = float("nan")
-    moving: bool
-    on_target: bool
-    referenced: bool
+
+
+class FineStageSample(PoseSample, frozen=True, gc=False, kw_only=True):
+    """Pose of a 3-DOF fine stage in its own axes; `target_*` is the last commanded position (NaN if none)."""
+
+    position_fields = {"x": "x_um", "y": "y_um", "z": "z_um"}
+
+    x_um: float
+    y_um: float
+    z_um: float
+    target_x_um: float = float("nan")
+    target_y_um: float = float("nan")
+    target_z_um: float = float("nan")
+
+
+class ForceSample(Sample, frozen=True, gc=False, kw_only=True):
+    """Force along the sensor's axis: `force_uN` = `raw_uN` − `tare_uN`, NaN if the reading is not valid.
+
+    Flags: SATURATED (at the end of the range), DISCONNECTED (the amplifier has no sensor), STALE (no new reading has
+    come in time), UNTARED (no tare is set; the force is then the raw one).
+    """
+
+    force_uN: float
+    raw_uN: float
+    tare_uN: float = 0.0
 
 
 class ZoomSample(Sample, frozen=True, gc=False, kw_only=True):

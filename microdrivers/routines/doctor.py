@@ -11,7 +11,7 @@ from microdrivers.core.samples import Sample, XYThetaSample, ZoomSample
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.base import Device
 from microdrivers.devices.camera import Camera
-from microdrivers.devices.xytheta_stage import XYThetaStage, position_of
+from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
 from microdrivers.routines.camera_check import LEAST_RATE_SHARE, RATE_TIME_S, STAMP_LIMIT_NS, check_camera
@@ -143,7 +143,7 @@ def _check_state(rig: Rig, device: Device[Any], sample: Sample, found: DeviceDia
     if isinstance(sample, XYThetaSample | ZoomSample) and sample.moving:
         found.warn("it moves although nobody told it to", f"microdrivers stop {file}")
     if isinstance(device, XYThetaStage) and isinstance(sample, XYThetaSample):
-        for axis, position in position_of(sample).items():
+        for axis, position in sample.position.items():
             if axis not in axes and position not in device.limits[axis]:
                 unit = device.axes[axis].unit
                 found.problem(
@@ -267,7 +267,7 @@ def _judge_step(
 
 def _pose(stage: XYThetaStage) -> dict[str, float]:
     """Mean of a few readings at rest."""
-    poses = [position_of(stage.read()) for _ in range(_POSES)]
+    poses = [stage.read().position for _ in range(_POSES)]
     return {axis: statistics.fmean(pose[axis] for pose in poses) for axis in ("x", "y")}
 
 

@@ -1,0 +1,104 @@
+"""The 3-DOF fine stages that carry probe and gripper."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+
+from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.samples import FineStageSample
+from microdrivers.devices.motion import Move
+from microdrivers.devices.stage import Stage
+
+Vector = tuple[float, float, float]
+
+_log = logging.getLogger(__name__)
+
+
+class FineStage(Stage[FineStageSample]):
+    """A 3-DOF fine stage in its own axes x, y, z (µm); see `Stage`.
+
+    Attributes:
+        axes_in_rig: the unit vector of each axis in the rig's frame (a holder may be tilted against the rig).
+        retract_um: the way, in the stage's own axes, that takes the tool away from the sample; None if the rig file
+            states none.
+    """
+
+    sample_type = FineStageSample
+    axis_names = ("x", "y", "z")
+
+    axes_in_rig: Mapping[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+    retract_um: Vector | None = None
+
+    def move_to(
+        self,
+        *,
+        x_um: float | None = None,
+        y_um: float | None = None,
+        z_um: float | None = None,
+        speed_um_s: float | None = None,
+    ) -> FineStageSample:
+        """Move to an absolute position and block until settled; returns the observed pose.
+
+        Raises:
+            OutOfRange, NotReferenced, LinkLost: before anything moves.
+            MotionError: the move began and did not end as asked; the stage was stopped.
+        """
+        return self.start_move_to(x_um=x_um, y_um=y_um, z_um=z_um, speed_um_s=speed_um_s).wait()
+
+    def move_by(
+        self, *, dx_um: float = 0.0, dy_um: float = 0.0, dz_um: float = 0.0, speed_um_s: float | None = None
+    ) -> FineStageSample:
+        """Move relative to the last target (or the present position if there is none) and block until settled.
+
+        It is sent as an absolute target, once: a failed exchange is never repeated.
+        """
+        targets = self._shifted({"x": dx_um, "y": dy_um, "z": dz_um})
+        return self.move_to(x_um=targets["x"], y_um=targets["y"], z_um=targets["z"], speed_um_s=speed_um_s)
+
+    def start_move_to(
+        self,
+        *,
+        x_um: float | None = None,
+        y_um: float | None = None,
+        z_um: float | None = None,
+        speed_um_s: float | None = None,
+    ) -> Move[FineStageSample]:
+        """Command an absolute move and return at once; a newer move supersedes an older one.
+
+        `speed_um_s` is the path speed: all axes start and arrive together. Default: the slowest moved axis' fastest.
+        """
+
+        def speeds_of(start: Mapping[str, float], targets: Mapping[str, float]) -> dict[str, float]:
+            return self._path_speeds(start, targets, self.axis_names, speed_um_s)
+
+        return self._command({"x": x_um, "y": y_um, "z": z_um}, speeds_of)
+
+    def retract(self) -> Move[FineStageSample]:
+        """Take the tool away from the sample, as fast as the axes allow: by `retract_um` from where it is.
+
+        If the travel ends on the way the tool goes as far along the vector as it can, which is logged.
+
+        Raises:
+            UnsupportedError: the rig file states no way. NotReferenced, LinkLost: nothing has moved.
+        """
+        if self.retract_um is None:
+            raise UnsupportedError(
+                "the rig file does not say which way leads away from the sample",
+                device=self.name,
+                remedy="state retract_um: [x, y, z] of this stage in its own axes, for example [0, 0, 500]",
+            )
+        here = self.read().position
+        way = dict(zip(self.axis_names, self.retract_um, strict=True))
+        share = min(1.0, *(self._free_share(axis, here[axis], length) for axis, length in way.items()))
+        if share < 1.0:
+            _log.warning("%s: only %.0f %% of retract_um lies within the travel", self.name, 100 * share)
+        targets = {axis: here[axis] + share * length if length else None for axis, length in way.items()}
+        return self.start_move_to(x_um=targets["x"], y_um=targets["y"], z_um=targets["z"])
+
+    def _free_share(self, axis: str, position: float, length: float) -> float:
+        """How much of a way along one axis its travel allows, 0 to 1."""
+        limits = self.limits[axis]
+        room = (limits.max - position) if length > 0 else (position - limits.min)
+        return math.inf if length == 0 else max(0.0, room) / abs(length)

@@ -1,0 +1,194 @@
+"""What stages of several axes share: checks before anything moves, referencing in order, supervised moves."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, TypeVar
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
+from microdrivers.core.errors import NotReferenced, OutOfRange, StaleData
+from microdrivers.core.samples import PoseSample
+from microdrivers.core.units import Range, check_range, seconds_to_ns
+from microdrivers.devices.base import Device
+from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, move_duration_s
+
+MOVE_MARGIN_S = 0.5
+_RECENT_POSE_S = 0.1
+_SLOWEST_UM_S = 1e-3
+
+PoseT = TypeVar("PoseT", bound=PoseSample)
+
+
+class Stage(Device[PoseT]):
+    """A stage of several axes: absolute positions are valid only after `reference()`.
+
+    The public methods check (finite, within `limits`, referenced, speed) and raise BEFORE anything moves; nothing is
+    ever clipped. A driver supplies `_start_move`, `_reference_axis`, `referenced` and the hooks of `Device`, and fills
+    `axes` (its limits are the intersection of travel and rig limits) and `settle_s` when it opens.
+
+    Attributes:
+        axis_names: all axes, in their order.
+        axes: what is known of each.
+        settle_s: how long a move may take to settle after its profile has ended.
+    """
+
+    axis_names: ClassVar[tuple[str, ...]]
+
+    axes: Mapping[str, AxisSpec]
+    settle_s: float = 0.1
+
+    def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
+        super().__init__(name, clock=clock, bus=bus)
+        self._move: MoveSlot[PoseT] = MoveSlot()
+
+    # ------------------------------------------------------------------ what a driver supplies
+
+    @abstractmethod
+    def _start_move(self, targets: Mapping[str, float], speeds: Mapping[str, float]) -> None:
+        """Command checked absolute targets (µm, deg) with a speed for each moved axis (µm/s, deg/s)."""
+
+    @abstractmethod
+    def _reference_axis(self, axis: str) -> None:
+        """Reference one axis and return when the device reports that it is done."""
+
+    @property
+    @abstractmethod
+    def referenced(self) -> Mapping[str, bool]:
+        """Whether the reference of each axis is known, as the device last reported."""
+
+    # ------------------------------------------------------------------ public
+
+    @property
+    def limits(self) -> Mapping[str, Range]:
+        """Travel of each axis, µm or degrees."""
+        return {name: Range(axis.min_position, axis.max_position) for name, axis in self.axes.items()}
+
+    @property
+    def max_speed(self) -> Mapping[str, float]:
+        """Largest speed of each axis, µm/s or deg/s."""
+        return {name: axis.max_speed for name, axis in self.axes.items()}
+
+    @property
+    def resolution(self) -> Mapping[str, float]:
+        """Smallest commanded step of each axis, µm or degrees."""
+        return {name: axis.resolution for name, axis in self.axes.items()}
+
+    def reference(self, axes: Sequence[str]) -> None:
+        """Find the reference of the named axes, in exactly that order. Moves the stage to its switches.
+
+        Raises:
+            OutOfRange: an unknown or repeated axis. DeviceFault, NotReached: referencing failed.
+        """
+        with self._naming_errors():
+            self._require_open()
+            if not axes or len(set(axes)) != len(axes) or not set(axes) <= set(self.axis_names):
+                raise OutOfRange(
+                    f"axes to reference: {', '.join(axes) or 'none'}",
+                    remedy=f"name {', '.join(self.axis_names)} once each",
+                )
+            self._move.supersede()
+            for axis in axes:
+                self._reference_axis(axis)
+                self._publish_event("reference_found", reason=f"axis {axis}")
+
+    def stop(self, *, by: str = "user", reason: str = "") -> None:
+        """Stop all axes now; a running `Move` ends as cancelled."""
+        self._move.stopped()
+        super().stop(by=by, reason=reason)
+
+    # ------------------------------------------------------------------ for the kinds of stages
+
+    def _command(
+        self,
+        asked: Mapping[str, float | None],
+        speeds_of: Callable[[Mapping[str, float], Mapping[str, float]], dict[str, float]],
+    ) -> Move[PoseT]:
+        """Check targets, command them and supervise; `speeds_of` splits the speed for a start and its targets."""
+        with self._naming_errors():
+            self._require_open()
+            targets = {axis: value for axis, value in asked.items() if value is not None}
+            self._check_targets(targets)
+            start = self._recent_pose().position
+            speeds = speeds_of(start, targets)
+            stops_before = self._move.supersede()
+            self._start_move(targets, speeds)
+        return self._move.hold(self._supervise(start, targets, speeds), stops_before)
+
+    def _shifted(self, shifts: Mapping[str, float]) -> dict[str, float | None]:
+        """Absolute targets that lie so far from the last targets, or from the present position if there is none."""
+        pose = self.read()
+        last, here = pose.target, pose.position
+        return {
+            axis: (last[axis] if math.isfinite(last[axis]) else here[axis]) + shift if shift else None
+            for axis, shift in shifts.items()
+        }
+
+    def _path_speeds(
+        self, start: Mapping[str, float], targets: Mapping[str, float], axes: Sequence[str], speed_um_s: float | None
+    ) -> dict[str, float]:
+        """Split a path speed so that the linear `axes` that move arrive together.
+
+        Default is the speed of the slowest of them.
+        """
+        moved = [axis for axis in axes if axis in targets]
+        if not moved:
+            return {}
+        distance = {axis: abs(targets[axis] - start[axis]) for axis in moved}
+        path_um = math.hypot(*distance.values())
+        fastest = min(self.max_speed[axis] for axis in moved)
+        asked = fastest if speed_um_s is None else speed_um_s
+        check_range(asked, Range(_SLOWEST_UM_S, fastest), what="speed", unit="µm/s", device=self.name)
+        shares = {axis: distance[axis] / path_um if path_um > 0 else 1.0 for axis in moved}
+        return {axis: max(asked * share, self.axes[axis].resolution) for axis, share in shares.items()}
+
+    # ------------------------------------------------------------------ checks and supervision
+
+    def _check_targets(self, targets: Mapping[str, float]) -> None:
+        if not targets:
+            raise OutOfRange(
+                "a move needs at least one target", remedy=f"give one of {', '.join(self.axis_names)} with its unit"
+            )
+        for axis, target in targets.items():
+            unit = self.axes[axis].unit
+            check_range(target, self.limits[axis], what=f"target of axis {axis}", unit=unit, device=self.name)
+        unknown = [axis for axis in targets if not self.referenced[axis]]
+        if unknown:
+            raise NotReferenced(
+                f"the reference of axis {', '.join(unknown)} is not known, so no absolute move is possible",
+                remedy=f"make sure that the way is free, then reference({unknown!r})",
+            )
+
+    def _recent_pose(self) -> PoseT:
+        try:
+            return self.latest(max_age_s=_RECENT_POSE_S)
+        except StaleData:
+            return self.read()
+
+    def _supervise(
+        self, start: Mapping[str, float], targets: Mapping[str, float], speeds: Mapping[str, float]
+    ) -> Move[PoseT]:
+        longest_s = max(
+            move_duration_s(
+                distance=abs(targets[axis] - start[axis]),
+                speed=speeds[axis],
+                acceleration=self.axes[axis].acceleration,
+            )
+            for axis in targets
+        )
+        deadline_s = 1.2 * longest_s + self.settle_s + MOVE_MARGIN_S
+        return Move(
+            device=self.name,
+            clock=self.clock,
+            read=self.read,
+            position_of=lambda sample: sample.position,
+            arrived=lambda sample: sample.on_target and not sample.moving,
+            referenced=lambda _sample: all(self.referenced[axis] for axis in targets),
+            stop=lambda: Stage.stop(self, by="supervision", reason="move failed or cancelled"),
+            target=targets,
+            start=start,
+            axes=self.axes,
+            deadline_t_ns=self.clock.now_ns() + seconds_to_ns(deadline_s),
+        )
