@@ -157,7 +157,10 @@ class ForceSensor(Device[ForceSample]):
         slope = float(centred_s @ raw) / spread_s2 if spread_s2 > 0 else 0.0
         scatter = float(np.sqrt(np.mean((raw - raw.mean() - slope * centred_s) ** 2)))
         change_uN = slope * float(time_s[-1])
-        certain = abs(slope) * math.sqrt(spread_s2) > _DRIFT_T * max(scatter, 0.3 * self.resolution_uN)
+        # Noise within the bandwidth is the same in neighbouring readings: they count as fewer.
+        repeats = max(1.0, len(readings) / max(2.0 * self.bandwidth_hz * float(time_s[-1]), 1.0))
+        deviation = math.sqrt(repeats) * max(scatter, 0.3 * self.resolution_uN)
+        certain = abs(slope) * math.sqrt(spread_s2) > _DRIFT_T * deviation
         if certain and abs(change_uN) > self.resolution_uN:
             raise RefusedError(
                 f"no zero can be taken while the reading drifts: {change_uN:+.3g} µN in {time_s[-1]:.2g} s",
