@@ -16,7 +16,9 @@ from microdrivers.devices.base import Device
 from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, move_duration_s
 
 MOVE_MARGIN_S = 0.5
-_RECENT_POSE_S = 0.1
+_RECENT_AT_REST_S = 0.1
+_RECENT_IN_MOTION_S = 0.03
+"""How old a pose may be that a move is said to start from; at full speed the stage gets well less far than it brakes."""
 _SLOWEST_UM_S = 1e-3
 
 PoseT = TypeVar("PoseT", bound=PoseSample)
@@ -43,6 +45,7 @@ class Stage(Device[PoseT]):
     def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
         super().__init__(name, clock=clock, bus=bus)
         self._move: MoveSlot[PoseT] = MoveSlot()
+        self._commanded_ns = -1
 
     # ------------------------------------------------------------------ what a driver supplies
 
@@ -114,7 +117,10 @@ class Stage(Device[PoseT]):
             start = self._recent_pose().position
             speeds = speeds_of(start, targets)
             stops_before = self._move.supersede()
-            self._start_move(targets, speeds)
+            try:
+                self._start_move(targets, speeds)
+            finally:
+                self._commanded_ns = self.clock.now_ns()
         return self._move.hold(self._supervise(start, targets, speeds), stops_before)
 
     def _shifted(self, shifts: Mapping[str, float]) -> dict[str, float | None]:
@@ -162,8 +168,10 @@ class Stage(Device[PoseT]):
             )
 
     def _recent_pose(self) -> PoseT:
+        newest = self.topic.latest
+        rests = newest is not None and not newest.moving and newest.t_ns > self._commanded_ns
         try:
-            return self.latest(max_age_s=_RECENT_POSE_S)
+            return self.latest(max_age_s=_RECENT_AT_REST_S if rests else _RECENT_IN_MOTION_S)
         except StaleData:
             return self.read()
 

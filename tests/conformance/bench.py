@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
+import pytest
 import yaml
 
 from microdrivers.configs import shipped_rig
@@ -16,36 +17,113 @@ from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
-from microdrivers.rig import Rig, build_rig, load_rig_file, open_rig
+from microdrivers.fakes.wire import Reply, Wire, wire_named
+from microdrivers.rig import Rig, build_rig, load_rig_file
 from microdrivers.rig.serving import ServedRig
+
+Given = TypeVar("Given")
+
+
+class Bench:
+    """What the benches of all kinds have in common."""
+
+    @staticmethod
+    def need(ability: Given | None) -> Given:
+        """What a check cannot do without; where the bench does not have it the check is skipped."""
+        if ability is None:
+            pytest.skip("this bench cannot do that")
+        return ability
 
 
 @dataclass
-class StageBench:
-    """`truth(axis, t_ns)` is where the table is, µm or degrees; `noise` bounds encoder noise and quantisation."""
+class StageBench(Bench):
+    """A stage, and what is true of it.
+
+    `truth(axis, t_ns)` is where the table is, µm or degrees, by another way than the driver: the emulator's own axis, a
+    gauge. `noise_um` bounds encoder noise and quantisation. `power_cycle()` switches the controller off and on. While
+    the context `silence()` is open the device hears and does not answer.
+    """
 
     stage: XYThetaStage
     clock: Clock
     truth: Callable[[str, int], float]
     noise_um: float = 0.1
+    home: Mapping[str, float] = field(default_factory=lambda: {"x": 7500.0, "y": 7500.0, "theta": 0.0})
+    power_cycle: Callable[[], None] | None = None
+    silence: Callable[[], AbstractContextManager[None]] | None = None
+
+    @property
+    def device(self) -> XYThetaStage:
+        """The device under test."""
+        return self.stage
 
 
 @dataclass
-class ZoomBench:
-    """`true_steps(t_ns)` is where the motor is."""
+class ZoomBench(Bench):
+    """A zoom motor; `true_steps(t_ns)` is where it is. `silence` as for a stage."""
 
     zoom: ZoomMotor
     clock: Clock
     true_steps: Callable[[int], float]
+    silence: Callable[[], AbstractContextManager[None]] | None = None
+
+    @property
+    def device(self) -> ZoomMotor:
+        """The device under test."""
+        return self.zoom
 
 
 @dataclass
-class CameraBench:
-    """`true_middle_ns(frame_id)` is when the middle of that exposure really was."""
+class CameraBench(Bench):
+    """A camera; `true_middle_ns(frame_id)` is when the middle of that exposure really was."""
 
     camera: Camera
     clock: Clock
     true_middle_ns: Callable[[int], int]
+
+
+class _Deaf:
+    """Stands in for an emulator that is to be silent."""
+
+    def receive(self, data: bytes, start_ns: int, end_ns: int) -> Sequence[Reply]:
+        return ()
+
+    def advance(self, t_ns: int) -> Sequence[Reply]:
+        return ()
+
+    def next_event_ns(self) -> int | None:
+        return None
+
+
+@contextmanager
+def _silence(wire: Wire) -> Iterator[None]:
+    emulator, wire.emulator = wire.emulator, _Deaf()
+    try:
+        yield
+    finally:
+        wire.emulator = emulator
+
+
+def _wire_of(name: str) -> Any:
+    wire = wire_named(name)
+    assert wire is not None
+    return wire
+
+
+def _stage_bench(stage: XYThetaStage, clock: Clock, world: Any) -> StageBench:
+    wire = _wire_of(stage.name)
+    return StageBench(
+        stage,
+        clock,
+        truth=lambda axis, t_ns: world.stage_axes[axis].position_at(t_ns),
+        power_cycle=lambda: wire.emulator.power_cycle(clock.now_ns()),
+        silence=lambda: _silence(wire),
+    )
+
+
+def _zoom_bench(zoom: ZoomMotor, clock: Clock, world: Any) -> ZoomBench:
+    wire = _wire_of(zoom.name)
+    return ZoomBench(zoom, clock, world.zoom_axis.position_at, silence=lambda: _silence(wire))
 
 
 def _replace(rig: Rig, name: str, driver: type[Any] | None) -> None:
@@ -55,37 +133,46 @@ def _replace(rig: Rig, name: str, driver: type[Any] | None) -> None:
         rig.devices[name] = driver(name, rig.simulation.settings_of(name), clock=rig.clock, bus=rig.bus)
 
 
-def _emulated(seed: int) -> Rig:
-    return build_rig(shipped_rig(), fake=True, seed=seed, clock=SimulatedClock())
+def _emulated(seed: int, file: Path | None = None) -> Rig:
+    return build_rig(file or shipped_rig(), fake=True, seed=seed, clock=SimulatedClock())
 
 
 @contextmanager
-def stage_bench(driver: type[Any] | None = None, *, referenced: bool = True, seed: int = 3) -> Iterator[StageBench]:
-    """The GCS stage on its emulator."""
-    rig = _emulated(seed)
+def stage_bench(
+    driver: type[Any] | None = None, *, referenced: bool = True, seed: int = 3, file: Path | None = None
+) -> Iterator[StageBench]:
+    """The GCS stage of a rig file on its emulator."""
+    rig = _emulated(seed, file)
     _replace(rig, "sample_stage", driver)
     with rig:
         stage = rig.device("sample_stage", XYThetaStage)
-        world: Any = rig.simulation.world
         if referenced:
             stage.reference(["x", "y", "theta"])
-        yield StageBench(stage, rig.clock, lambda axis, t_ns: world.stage_axes[axis].position_at(t_ns))
+        yield _stage_bench(stage, rig.clock, rig.simulation.world)
 
 
 @contextmanager
-def zoom_bench(driver: type[Any] | None = None, *, seed: int = 3) -> Iterator[ZoomBench]:
-    """The AZ zoom on its emulator."""
-    rig = _emulated(seed)
+def zoom_bench(driver: type[Any] | None = None, *, seed: int = 3, file: Path | None = None) -> Iterator[ZoomBench]:
+    """The AZ zoom of a rig file on its emulator."""
+    rig = _emulated(seed, file)
     _replace(rig, "zoom", driver)
     with rig:
-        world: Any = rig.simulation.world
-        yield ZoomBench(rig.device("zoom", ZoomMotor), rig.clock, world.zoom_axis.position_at)
+        yield _zoom_bench(rig.device("zoom", ZoomMotor), rig.clock, rig.simulation.world)
 
 
 @contextmanager
-def served(transport: Literal["pty", "tcp"], *devices: str, seed: int = 3) -> Iterator[tuple[Rig, ServedRig]]:
-    """Some devices of the workstation in real time, on ports of the operating system."""
-    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+def served(
+    transport: Literal["pty", "tcp"],
+    *devices: str,
+    seed: int = 3,
+    file: Path | None = None,
+    drivers: Mapping[str, type[Any]] | None = None,
+) -> Iterator[tuple[Rig, ServedRig]]:
+    """Some devices of a rig file (the workstation) in real time, on ports of the operating system.
+
+    `drivers` are others, such as ones with a planted fault, by the device that they are put in front of.
+    """
+    data = yaml.safe_load((file or shipped_rig()).read_text(encoding="utf-8"))
     data.pop("microscope")
     data["devices"] = {name: data["devices"][name] for name in devices}
     with tempfile.TemporaryDirectory() as folder:
@@ -95,26 +182,33 @@ def served(transport: Literal["pty", "tcp"], *devices: str, seed: int = 3) -> It
         world.write_text("stage: {power_on_spread_um: 30}\n", encoding="utf-8")  # a short way to the reference
         with ServedRig(load_rig_file(part), transport=transport, seed=seed, world=world) as serving:
             serving.write(pointing)
-            with open_rig(pointing) as rig:
+            rig = build_rig(pointing)
+            for name, driver in (drivers or {}).items():
+                settings = rig.description.devices[name].settings
+                rig.devices[name] = driver(name, settings, clock=rig.clock, bus=rig.bus)
+            with rig:
                 yield rig, serving
 
 
 @contextmanager
-def served_stage_bench(transport: Literal["pty", "tcp"]) -> Iterator[StageBench]:
+def served_stage_bench(
+    transport: Literal["pty", "tcp"], driver: type[Any] | None = None, *, file: Path | None = None
+) -> Iterator[StageBench]:
     """The GCS stage on a port of the operating system."""
-    with served(transport, "sample_stage") as (rig, serving):
+    drivers = {} if driver is None else {"sample_stage": driver}
+    with served(transport, "sample_stage", file=file, drivers=drivers) as (rig, serving):
         stage = rig.device("sample_stage", XYThetaStage)
-        world: Any = serving.simulation.world
         stage.reference(["x", "y", "theta"])
-        yield StageBench(stage, rig.clock, lambda axis, t_ns: world.stage_axes[axis].position_at(t_ns))
+        yield _stage_bench(stage, rig.clock, serving.simulation.world)
 
 
 @contextmanager
-def served_zoom_bench(transport: Literal["pty", "tcp"]) -> Iterator[ZoomBench]:
+def served_zoom_bench(
+    transport: Literal["pty", "tcp"], driver: type[Any] | None = None, *, file: Path | None = None
+) -> Iterator[ZoomBench]:
     """The AZ zoom on a port of the operating system."""
-    with served(transport, "zoom") as (rig, serving):
-        world: Any = serving.simulation.world
-        yield ZoomBench(rig.device("zoom", ZoomMotor), rig.clock, world.zoom_axis.position_at)
+    with served(transport, "zoom", file=file, drivers={} if driver is None else {"zoom": driver}) as (rig, serving):
+        yield _zoom_bench(rig.device("zoom", ZoomMotor), rig.clock, serving.simulation.world)
 
 
 @contextmanager

@@ -1,4 +1,8 @@
-"""What every XYθ stage must do."""
+"""What every XYθ stage must do.
+
+The bench has put the stage at `home`, referenced, with free travel of −400 … +4500 µm in x, −400 … +200 µm in y and
+±0.5° around it.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,12 @@ from tests.conformance.checks import Suite
 SUITE = Suite()
 
 
+def _near(bench: StageBench, **shifts: float) -> dict[str, float]:
+    """Targets that lie so far from home."""
+    axes = {"x_um": "x", "y_um": "y", "theta_deg": "theta"}
+    return {name: bench.home[axes[name]] + shift for name, shift in shifts.items()}
+
+
 def _truth(bench: StageBench) -> dict[str, float]:
     now_ns = bench.clock.now_ns()
     return {axis: bench.truth(axis, now_ns) for axis in ("x", "y", "theta")}
@@ -23,19 +33,19 @@ def _truth(bench: StageBench) -> dict[str, float]:
 def moves_each_axis_its_own_way(bench: StageBench) -> None:
     """Sign, axis and unit: +150 µm on x is +150 µm on x and nothing on y."""
     start = _truth(bench)
-    bench.stage.move_to(x_um=7500.0 + 150.0)
+    bench.stage.move_to(**_near(bench, x_um=150.0))
     assert _truth(bench)["x"] - start["x"] == pytest.approx(150.0, abs=0.5)
     assert _truth(bench)["y"] - start["y"] == pytest.approx(0.0, abs=0.5)
-    bench.stage.move_to(y_um=7500.0 - 90.0)
+    bench.stage.move_to(**_near(bench, y_um=-90.0))
     assert _truth(bench)["y"] - start["y"] == pytest.approx(-90.0, abs=0.5)
-    bench.stage.move_to(theta_deg=0.25)
+    bench.stage.move_to(**_near(bench, theta_deg=0.25))
     assert _truth(bench)["theta"] - start["theta"] == pytest.approx(0.25, abs=0.001)
 
 
 @SUITE.check
 def reads_where_it_is(bench: StageBench) -> None:
     """A reading at rest agrees with the truth on all axes, sign and unit included."""
-    bench.stage.move_to(x_um=7612.3, y_um=7433.1, theta_deg=-0.5)
+    bench.stage.move_to(**_near(bench, x_um=112.3, y_um=-66.9, theta_deg=-0.5))
     bench.clock.sleep(0.2)
     pose = bench.stage.read()
     assert pose.x_um == pytest.approx(bench.truth("x", pose.t_ns), abs=bench.noise_um)
@@ -48,7 +58,7 @@ def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
     """In motion at 1 mm/s, the pose is that of its stamp within noise and the stated (95 %) uncertainty of time."""
     samples: list[XYThetaSample] = []
     bench.stage.topic.subscribe(samples.append)
-    move = bench.stage.start_move_to(x_um=8200.0, speed_um_s=1000.0)
+    move = bench.stage.start_move_to(**_near(bench, x_um=700.0), speed_um_s=1000.0)
     with bench.stage.stream(100.0):
         bench.clock.sleep(0.5)
     move.wait()
@@ -65,7 +75,13 @@ def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
 @SUITE.check
 def refuses_what_is_out_of_range_and_moves_nothing(bench: StageBench) -> None:
     start = _truth(bench)
-    for target in ({"x_um": 15_000.1}, {"y_um": -0.1}, {"theta_deg": 180.01}, {"x_um": 7600.0, "y_um": 1e6}):
+    limits = bench.stage.limits
+    for target in (
+        {"x_um": limits["x"].max + 0.1},
+        {"y_um": limits["y"].min - 0.1},
+        {"theta_deg": limits["theta"].max + 0.01},
+        {**_near(bench, x_um=100.0), "y_um": 1e6},
+    ):
         with pytest.raises(OutOfRange):
             bench.stage.start_move_to(**target)
     bench.clock.sleep(0.3)
@@ -79,7 +95,7 @@ def refuses_what_is_not_finite(bench: StageBench) -> None:
         with pytest.raises(OutOfRange):
             bench.stage.start_move_to(x_um=bad)
         with pytest.raises(OutOfRange):
-            bench.stage.start_move_to(x_um=7600.0, speed_um_s=bad)
+            bench.stage.start_move_to(**_near(bench, x_um=100.0), speed_um_s=bad)
     bench.clock.sleep(0.3)
     assert _truth(bench) == pytest.approx(start, abs=1e-6)
 
@@ -87,7 +103,7 @@ def refuses_what_is_not_finite(bench: StageBench) -> None:
 @SUITE.check
 def refuses_too_high_a_speed(bench: StageBench) -> None:
     with pytest.raises(OutOfRange):
-        bench.stage.start_move_to(x_um=7600.0, speed_um_s=1e5)
+        bench.stage.start_move_to(**_near(bench, x_um=100.0), speed_um_s=1e5)
 
 
 @SUITE.check
@@ -96,7 +112,7 @@ def is_on_target_only_when_it_is_there(bench: StageBench) -> None:
     tolerance_um = bench.stage.axes["x"].tolerance + bench.noise_um
     samples: list[XYThetaSample] = []
     bench.stage.topic.subscribe(samples.append)
-    for target in (8100.0, 8100.6, 7900.0):
+    for target in (bench.home["x"] + shift for shift in (600.0, 600.6, 400.0)):
         bench.stage.move_to(x_um=target)
         assert bench.truth("x", bench.clock.now_ns()) == pytest.approx(target, abs=tolerance_um)
         for sample in samples:
@@ -106,44 +122,44 @@ def is_on_target_only_when_it_is_there(bench: StageBench) -> None:
 
 @SUITE.check
 def a_stop_ends_the_motion_and_the_move(bench: StageBench) -> None:
-    move = bench.stage.start_move_to(x_um=12_000.0)
+    move = bench.stage.start_move_to(**_near(bench, x_um=4500.0))
     bench.clock.sleep(0.3)
     bench.stage.stop()
     bench.clock.sleep(0.3)
     at_rest = _truth(bench)
     bench.clock.sleep(0.3)
     assert _truth(bench) == pytest.approx(at_rest, abs=0.01)
-    assert at_rest["x"] < 8500.0
+    assert at_rest["x"] < bench.home["x"] + 4000.0
     with pytest.raises(MoveCancelled):
         move.wait()
-    bench.stage.move_to(x_um=7600.0)
-    assert _truth(bench)["x"] == pytest.approx(7600.0, abs=0.5)
+    bench.stage.move_to(**_near(bench, x_um=100.0))
+    assert _truth(bench)["x"] == pytest.approx(bench.home["x"] + 100.0, abs=0.5)
 
 
 @SUITE.check
 def a_newer_move_supersedes_the_older(bench: StageBench) -> None:
-    older = bench.stage.start_move_to(x_um=9000.0)
+    older = bench.stage.start_move_to(**_near(bench, x_um=1500.0))
     bench.clock.sleep(0.1)
-    bench.stage.move_to(x_um=7400.0)
+    bench.stage.move_to(**_near(bench, x_um=-100.0))
     with pytest.raises(MoveSuperseded):
         older.wait()
-    assert _truth(bench)["x"] == pytest.approx(7400.0, abs=0.5)
+    assert _truth(bench)["x"] == pytest.approx(bench.home["x"] - 100.0, abs=0.5)
 
 
 @SUITE.check
 def a_relative_move_counts_from_the_last_target(bench: StageBench) -> None:
-    bench.stage.move_to(x_um=7600.0)
+    bench.stage.move_to(**_near(bench, x_um=100.0))
     for _ in range(5):
         bench.stage.move_by(dx_um=10.0)
-    assert _truth(bench)["x"] == pytest.approx(7650.0, abs=0.3)
+    assert _truth(bench)["x"] == pytest.approx(bench.home["x"] + 150.0, abs=0.3)
 
 
 @SUITE.check
 def x_and_y_arrive_together_at_the_path_speed(bench: StageBench) -> None:
-    bench.stage.start_move_to(x_um=7500.0 + 300.0, y_um=7500.0 - 400.0, speed_um_s=500.0)
+    bench.stage.start_move_to(**_near(bench, x_um=300.0, y_um=-400.0), speed_um_s=500.0)
     bench.clock.sleep(0.6)
     truth = _truth(bench)
-    dx_um, dy_um = truth["x"] - 7500.0, truth["y"] - 7500.0
+    dx_um, dy_um = truth["x"] - bench.home["x"], truth["y"] - bench.home["y"]
     assert math.hypot(dx_um, dy_um) == pytest.approx(500.0 * 0.6, rel=0.1)
     assert dx_um / 300.0 == pytest.approx(-dy_um / 400.0, rel=0.05)
 
@@ -151,19 +167,11 @@ def x_and_y_arrive_together_at_the_path_speed(bench: StageBench) -> None:
 @SUITE.check
 def an_unreferenced_axis_refuses_absolute_moves(bench: StageBench) -> None:
     assert all(bench.stage.referenced.values())
-    _power_cycle(bench)
+    bench.need(bench.power_cycle)()
     bench.stage.read()
     assert not any(bench.stage.referenced.values())
     start = _truth(bench)
     with pytest.raises(NotReferenced):
-        bench.stage.start_move_to(x_um=7600.0)
+        bench.stage.start_move_to(**_near(bench, x_um=100.0))
     bench.clock.sleep(0.2)
     assert _truth(bench) == pytest.approx(start, abs=1e-6)
-
-
-def _power_cycle(bench: StageBench) -> None:
-    from microdrivers.fakes.wire import wire_named
-
-    wire = wire_named(bench.stage.name)
-    assert wire is not None
-    wire.emulator.power_cycle(bench.clock.now_ns())  # type: ignore[attr-defined]
