@@ -34,6 +34,8 @@ class CalibratorSettings(NamedTuple):
         scale_um: normalisation of X and Y about the first pose.
         max_pose_gap_s: a frame whose neighbouring poses lie further apart is left out.
         zoom_still: relative change of zoom between two samples below which the zoom counts as resting.
+        sigma_drift_um_s: how fast the sample may drift against the stage, standard deviation along X and Y; widens
+            the intervals of long runs. 18 µm in an hour is a stage that is still warming up.
     """
 
     forgetting: float = 0.99
@@ -42,6 +44,7 @@ class CalibratorSettings(NamedTuple):
     scale_um: float = 100.0
     max_pose_gap_s: float = 0.1
     zoom_still: float = 1e-3
+    sigma_drift_um_s: float = 0.005
 
 
 class OpticsCalibrator:
@@ -67,6 +70,7 @@ class OpticsCalibrator:
         self._tracker = tracker
         self._frames_left = math.inf if frames is None else frames
         self._synchroniser: Synchroniser[TrackedPoint] = Synchroniser(("stage", "zoom"))
+        self._first_ns = 0
         self._frame_index = 0
         self._clean_frames = 0
         self._to_flush = 0
@@ -113,7 +117,7 @@ class OpticsCalibrator:
     # ------------------------------------------------------------------ one frame
 
     def _estimate(self, point: TrackedPoint, pose: PoseAt, zoom: ZoomSample, next_zoom: ZoomSample) -> OpticsEstimate:
-        recursion = self._started(pose)
+        recursion = self._started(pose, point.t_ns)
         moving = self._zoom_moves(zoom, next_zoom)
         moved = moving or self._zoom_has_moved(point.t_ns, zoom)
         defined = recursion.frames_used >= 3
@@ -127,6 +131,7 @@ class OpticsCalibrator:
             vx_um_s=pose.velocity_x_um_s,
             vy_um_s=pose.velocity_y_um_s,
             sigma_time_s=math.hypot(point.dt_ns, pose.dt_ns) / (_HALF_WIDTH_95 * NS_PER_S),
+            t_s=(point.t_ns - self._first_ns) / NS_PER_S,
         )
         # Three measurements of one zoom are fitted exactly: only from the fourth on does a residual say anything.
         overdetermined = self._clean_frames > 3
@@ -136,11 +141,15 @@ class OpticsCalibrator:
         self._frame_index += 1
         return estimate
 
-    def _started(self, pose: PoseAt) -> ProjectionRecursion:
+    def _started(self, pose: PoseAt, t_ns: int) -> ProjectionRecursion:
         if self.recursion is None:
             self.recursion = ProjectionRecursion(
-                centre_um=(pose.x_um, pose.y_um), scale_um=self.settings.scale_um, ridge=self.settings.ridge
+                centre_um=(pose.x_um, pose.y_um),
+                scale_um=self.settings.scale_um,
+                ridge=self.settings.ridge,
+                sigma_drift_um_s=self.settings.sigma_drift_um_s,
             )
+            self._first_ns = t_ns
         return self.recursion
 
     def _zoom_moves(self, zoom: ZoomSample, next_zoom: ZoomSample) -> bool:

@@ -54,6 +54,7 @@ class ProjectionRecursion:
         scale_um: half-width of the travel in use, µm, > 0.
         ridge: δ of eq. (12), > 0; at most about 1e-9, or it biases P where three neighbouring poses decide.
         prior: θ⁰, (p11 p12 p13 p21 p22 p23) in px for the normalised coordinates.
+        sigma_drift_um_s: standard deviation of the sample's drift against the stage; only the uncertainty uses it.
 
     Raises:
         ValueError: `scale_um` or `ridge` is not positive and finite, or a centre or prior is not finite.
@@ -66,6 +67,7 @@ class ProjectionRecursion:
         scale_um: float,
         ridge: float = 1e-9,
         prior: Sequence[float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        sigma_drift_um_s: float = 0.0,
     ) -> None:
         if not (math.isfinite(scale_um) and scale_um > 0.0):
             raise ValueError(f"scale_um is {scale_um}: it must be positive and finite")
@@ -76,6 +78,8 @@ class ProjectionRecursion:
         self.centre_um = centre_um
         self.scale_um = scale_um
         self.ridge = ridge
+        self.sigma_drift_um_s = sigma_drift_um_s
+        self._now_s = 0.0
         self._cx, self._cy = centre_um
         p11, p12, p13, p21, p22, p23 = prior
         self._theta: Six = (p11, p12, p13, p21, p22, p23)
@@ -98,6 +102,7 @@ class ProjectionRecursion:
         vx_um_s: float = 0.0,
         vy_um_s: float = 0.0,
         sigma_time_s: float = 0.0,
+        t_s: float = 0.0,
     ) -> None:
         """Take one measurement, a stage pose and where the feature was seen (eqs. (14), (18), (19)).
 
@@ -111,6 +116,7 @@ class ProjectionRecursion:
             vy_um_s: stage velocity along Y, µm/s.
             sigma_time_s: standard deviation of the time offset between poses and images, s; the offset is
                 taken as unknown and common to all measurements.
+            t_s: the instant of the image, s from any instant common to all; only the uncertainty uses it.
 
         Raises:
             ValueError: `forgetting` is outside [0, 1].
@@ -122,17 +128,18 @@ class ProjectionRecursion:
         y = (y_um - self._cy) / self.scale_um
         xx = x * x
         yy = y * y
-        drift_x = sigma_time_s * vx_um_s
-        drift_y = sigma_time_s * vy_um_s
-        if not math.isfinite(xx + yy + u_px * u_px + v_px * v_px + drift_x * drift_x + drift_y * drift_y):
+        offset_x = sigma_time_s * vx_um_s
+        offset_y = sigma_time_s * vy_um_s
+        if not math.isfinite(xx + yy + u_px * u_px + v_px * v_px + offset_x * offset_x + offset_y * offset_y + t_s):
             raise DataError(
                 f"a measurement is not finite: X {x_um}, Y {y_um} µm, u {u_px}, v {v_px} px, "
-                f"velocity {vx_um_s}, {vy_um_s} µm/s, σ_time {sigma_time_s} s",
+                f"velocity {vx_um_s}, {vy_um_s} µm/s, σ_time {sigma_time_s} s, time {t_s} s",
                 remedy="leave out frames in which the target was not found or the stage gave no position",
             )
         row = (xx, x * y, x, yy, y, 1.0, x * u_px, y * u_px, u_px, x * v_px, y * v_px, v_px)
         self._accumulate(row, forgetting)
-        self._frames.append(forgetting, x, y, drift_x, drift_y, u_px, v_px, self._theta)
+        self._frames.append(forgetting, x, y, offset_x, offset_y, t_s, u_px, v_px, self._theta)
+        self._now_s = t_s
         if forgetting == 0.0 and self._frames_used > 2:
             self._frames_used = 2
         self._frames_used += 1
@@ -258,4 +265,6 @@ class ProjectionRecursion:
             theta=self._theta,
             centre_um=self.centre_um,
             scale_um=self.scale_um,
+            now_s=self._now_s,
+            sigma_drift_um_s=self.sigma_drift_um_s,
         )

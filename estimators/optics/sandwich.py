@@ -27,17 +27,21 @@ STACK = 3
 BLOCK = 256
 """Measurements that are kept one by one before those with a settled weight are summed up."""
 
-# λ, xn, yn, 1, σ_time·vX, σ_time·vY, u, v. Packing costs a quarter of an assignment to an array's row.
-_RECORD = struct.Struct("8d")
+# λ, xn, yn, 1, σ_time·vX, σ_time·vY, t, u, v. Packing costs a quarter of an assignment to an array's row.
+_RECORD = struct.Struct("9d")
+_COLUMNS = 9
+_OFFSET, _TIME, _RESIDUALS = slice(3, 5), 5, slice(6, 8)
+"""Places in z, see `WeightedTotals`."""
+_WIDTH = 8
 
 _SMALLEST_RESIDUAL_SHARE = 1e-9
 
 
 class WeightedTotals(NamedTuple):
-    """Weighted sums over measurements, with z = (xn, yn, 1, σ_time·vX, σ_time·vY, e_u, e_v), e the residuals.
+    """Weighted sums over measurements, with z = (xn, yn, 1, σ_time·vX, σ_time·vY, t, e_u, e_v), e the residuals.
 
     Attributes:
-        first: Σ w z zᵀ, 7 × 7.
+        first: Σ w z zᵀ, 8 × 8.
         second: Σ w² x xᵀ, 3 × 3.
         third: Σ w³ x xᵀ, 3 × 3.
     """
@@ -61,7 +65,7 @@ class WeightedFrames:
         self._records = bytearray(BLOCK * _RECORD.size)
         self._count = 0
         self._carried_weights: FloatArray = np.zeros(0)
-        self._settled = WeightedTotals(np.zeros((7, 7)), np.zeros((3, 3)), np.zeros((3, 3)))
+        self._settled = WeightedTotals(np.zeros((_WIDTH, _WIDTH)), np.zeros((3, 3)), np.zeros((3, 3)))
         self._reference: FloatArray = np.zeros((3, 2))
 
     def append(
@@ -69,8 +73,9 @@ class WeightedFrames:
         forgetting: float,
         xn: float,
         yn: float,
-        drift_x_um: float,
-        drift_y_um: float,
+        offset_x_um: float,
+        offset_y_um: float,
+        t_s: float,
         u_px: float,
         v_px: float,
         theta: Sequence[float],
@@ -81,14 +86,15 @@ class WeightedFrames:
             forgetting: λ of its update.
             xn: normalised X.
             yn: normalised Y.
-            drift_x_um: σ_time·vX, µm.
-            drift_y_um: σ_time·vY, µm.
+            offset_x_um: σ_time·vX, µm.
+            offset_y_um: σ_time·vY, µm.
+            t_s: when it was taken, s from some common instant.
             u_px: image coordinate, px.
             v_px: image coordinate, px.
             theta: the estimate that includes this measurement, as in `ProjectionRecursion.theta`.
         """
         place = self._count * _RECORD.size
-        _RECORD.pack_into(self._records, place, forgetting, xn, yn, 1.0, drift_x_um, drift_y_um, u_px, v_px)
+        _RECORD.pack_into(self._records, place, forgetting, xn, yn, 1.0, offset_x_um, offset_y_um, t_s, u_px, v_px)
         self._count += 1
         if self._count == BLOCK:
             self._sum_up(theta)
@@ -113,7 +119,7 @@ class WeightedFrames:
 
     def _table(self) -> FloatArray:
         """The recorded measurements, one a row; a view of the records."""
-        return np.frombuffer(self._records, dtype=np.float64).reshape(BLOCK, 8)[: self._count]
+        return np.frombuffer(self._records, dtype=np.float64).reshape(BLOCK, _COLUMNS)[: self._count]
 
     def _weights(self) -> tuple[FloatArray, float]:
         """Weights of the recorded measurements, and the factor by which all earlier ones have shrunk."""
@@ -158,8 +164,10 @@ def projection_uncertainty(
     theta: Sequence[float],
     centre_um: tuple[float, float],
     scale_um: float,
+    now_s: float = 0.0,
+    sigma_drift_um_s: float = 0.0,
 ) -> ProjectionUncertainty | None:
-    """Sandwich covariance of P, plus what a common time offset of the poses can do to it.
+    """Sandwich covariance of P, plus what a time offset of the poses and a drift of the sample can do to it.
 
     With H the hat matrix, the weighted residual sum of squares is a quadratic form in the noise with matrix
     `(I − H)ᵀ W (I − H)`. Its trace is `Σw − 2 tr(R⁻¹S) + tr(R⁻¹ R₀ R⁻¹ S)`, which makes Σ_y unbiased, and
@@ -169,12 +177,18 @@ def projection_uncertainty(
     a circle at constant speed that is the same as a rotation, so no residual shows it: it is added as a
     rank-one term.
 
+    A sample that drifts against the stage with velocity d shifts the image point of a measurement of age a by −A d a,
+    which on one turn of a circle is mostly a rotation and a change of scale: with d unknown, of standard deviation
+    `sigma_drift_um_s` in either direction, it adds `σ² (A Aᵀ) ⊗ g gᵀ`, g = R⁻¹ Σ w x a.
+
     Args:
         totals: sums over the measurements, with residuals about `theta`.
         information: 3 × 3, R with its ridge, normalised coordinates.
         theta: the estimate, normalised coordinates.
         centre_um: centre of the normalised coordinates, µm.
         scale_um: their scale, µm.
+        now_s: the instant for which P is wanted, on the scale of the measurements' times.
+        sigma_drift_um_s: standard deviation of the sample's drift along X and along Y, µm/s.
 
     Returns:
         None when the residuals leave nothing to judge the noise by.
@@ -189,13 +203,15 @@ def projection_uncertainty(
     trace_of_square = second[2, 2] - 2.0 * np.trace(inverse @ totals.third) + np.trace(bread_second @ bread_second)
     if not (trace > _SMALLEST_RESIDUAL_SHARE * weight_sum and trace_of_square > 0.0):
         return None
-    noise = totals.first[5:, 5:] / trace
+    noise = totals.first[_RESIDUALS, _RESIDUALS] / trace
     covariance = np.kron(noise, spread)
 
     coefficients = _as_columns(theta)
     linear_part = coefficients[:2].T / scale_um
-    shift = (inverse @ totals.first[:3, 3:5] @ linear_part.T).T.ravel()
+    shift = (inverse @ totals.first[:3, _OFFSET] @ linear_part.T).T.ravel()
     covariance += np.outer(shift, shift)
+    age = inverse @ (totals.first[:3, _TIME] - now_s * bare[:, 2])
+    covariance += sigma_drift_um_s**2 * np.kron(linear_part @ linear_part.T, np.outer(age, age))
 
     to_stage = np.array(
         [
@@ -221,7 +237,7 @@ def _as_columns(theta: Sequence[float]) -> FloatArray:
 def _sums(measurements: FloatArray, weights: FloatArray, coefficients: FloatArray) -> WeightedTotals:
     regressors = measurements[:, :3]
     z = measurements.copy()
-    z[:, 5:] -= regressors @ coefficients
+    z[:, _RESIDUALS] -= regressors @ coefficients
     once = weights[:, None] * z
     twice = weights[:, None] * once[:, :3]
     thrice = weights[:, None] * twice
@@ -230,8 +246,8 @@ def _sums(measurements: FloatArray, weights: FloatArray, coefficients: FloatArra
 
 def _moved(totals: WeightedTotals, change: FloatArray) -> WeightedTotals:
     """Residuals about a reference that has moved by `change` (3 × 2)."""
-    transform = np.eye(7)
-    transform[5:, :3] = -change.T
+    transform = np.eye(_WIDTH)
+    transform[_RESIDUALS, :3] = -change.T
     return totals._replace(first=transform @ totals.first @ transform.T)
 
 

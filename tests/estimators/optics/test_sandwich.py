@@ -128,7 +128,7 @@ def test_reading_the_uncertainty_changes_no_digit() -> None:
 def test_weights_by_hand() -> None:
     frames = WeightedFrames()
     for k, factor in enumerate([0.3, 0.5, 0.25, 0.5]):
-        frames.append(factor, float(k), 0.0, 0.0, 0.0, 0.0, 0.0, (0.0,) * 6)
+        frames.append(factor, float(k), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (0.0,) * 6)
     # Oldest first: (1·.5 + 1)·.25 + 1 = 1.375, halved; (1·.25 + 1)·.5 + 1; .5 + 1; 1.
     weights = np.array([0.6875, 1.625, 1.5, 1.0])
     totals = frames.totals((0.0,) * 6)
@@ -208,3 +208,44 @@ def test_the_time_offset_dominates_what_the_residuals_can_tell() -> None:
     added = (offset.covariance - still.covariance)[pick]
     assert np.allclose(added, np.outer(change.ravel(), change.ravel()), atol=0.05 * np.abs(added).max())
     assert offset.covariance[0, 0] > 4.0 * still.covariance[0, 0]
+
+
+def drifting_circle(drift_um_s: tuple[float, float], *, sigma_drift_um_s: float, noise_px: float, seed: int):
+    """One turn of 300 µm radius in 30 s over a sample that drifts; returns the true error and its covariance."""
+    rng = np.random.default_rng(seed)
+    truth = np.array([[0.2, 0.1, 5.0], [-0.1, 0.2, -7.0]])
+    recursion = ProjectionRecursion(centre_um=(0.0, 0.0), scale_um=100.0, sigma_drift_um_s=sigma_drift_um_s)
+    times_s = np.linspace(0.0, 30.0, 100)
+    for t_s in times_s:
+        turn = 2.0 * np.pi * t_s / 30.0
+        x, y = 300.0 * np.cos(turn), 300.0 * np.sin(turn)
+        age_s = times_s[-1] - t_s
+        u, v = truth @ (x - drift_um_s[0] * age_s, y - drift_um_s[1] * age_s, 1.0) + rng.normal(0.0, noise_px, 2)
+        recursion.update(x_um=x, y_um=y, u_px=u, v_px=v, forgetting=1.0, t_s=t_s)
+    found = recursion.uncertainty()
+    assert found is not None
+    return np.array(recursion.projection) - truth.ravel(), found.covariance
+
+
+def test_a_drift_without_noise_is_wholly_within_its_own_term() -> None:
+    """Of a drift of 1 σ along X, the error lies in the direction and has the size that the covariance says."""
+    sigma = 0.005
+    error, covariance = drifting_circle((sigma, 0.0), sigma_drift_um_s=sigma, noise_px=1e-6, seed=1)
+    _, without = drifting_circle((sigma, 0.0), sigma_drift_um_s=0.0, noise_px=1e-6, seed=1)
+    drift_part = covariance - without
+    assert np.linalg.matrix_rank(drift_part, tol=1e-9 * np.linalg.norm(drift_part)) == 2
+    assert error @ np.linalg.pinv(drift_part, rcond=1e-9) @ error == pytest.approx(1.0, rel=1e-3)
+
+
+def test_intervals_cover_the_truth_under_drift() -> None:
+    """Without the drift's term, 95 % intervals of the linear part would cover far less."""
+    rng = np.random.default_rng(5)
+    covered = {0.005: 0, 0.0: 0}
+    runs = 100
+    for seed in range(runs):
+        drift = tuple(rng.normal(0.0, 0.005, 2))
+        for sigma in covered:
+            error, covariance = drifting_circle(drift, sigma_drift_um_s=sigma, noise_px=0.01, seed=seed)
+            covered[sigma] += abs(error[1]) <= 1.985 * np.sqrt(covariance[1, 1])
+    assert 0.89 * runs <= covered[0.005] <= runs
+    assert covered[0.0] < 0.8 * runs
