@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 SEED   ?= 0
 OUT    ?= runs/demo
 
-.PHONY: demo test check format lock bench clean help
+.PHONY: demo test test-vm check format lock bench clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p;/^$$/q' Makefile
@@ -27,6 +27,12 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
+
+# The tests that need devices which a container lacks, in an emulated PC. The first time it fetches Debian's kernel.
+test-vm: $(READY)
+	$(BIN)/python scripts/vcan-run --setup qemu
+	$(BIN)/python scripts/vcan-run -b qemu -t 1200 -- \
+	  $(BIN)/python -m pytest -q -p no:cacheprovider -m vm $(PYTEST_ARGS) tests/vm
 
 check: $(READY)
 	$(BIN)/ruff check .

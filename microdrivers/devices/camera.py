@@ -239,7 +239,7 @@ class Camera(Device[Frame]):
                 f"region {wanted.roi} does not fit the sensor of {sensor_width}×{sensor_height} px",
                 remedy="give left, top, width, height in full-sensor pixels",
             )
-        if not wanted.rate_hz > 0 or not 0 < wanted.exposure_ms * wanted.rate_hz <= 1000:
+        if not wanted.rate_hz > 0 or not 0 < wanted.exposure_ms <= 1000 / wanted.rate_hz:
             raise OutOfRange(
                 f"an exposure of {wanted.exposure_ms:g} ms does not fit a rate of {wanted.rate_hz:g} Hz",
                 remedy="shorten the exposure or lower the rate",
