@@ -1,4 +1,4 @@
-"""An XYθ stage on a multi-axis controller that speaks PI GCS 2.0 (C-884 class)."""
+"""An XYθ stage on controllers that speak PI GCS 2.0: one for all axes (C-884 class) or three in a daisy chain."""
 
 from __future__ import annotations
 

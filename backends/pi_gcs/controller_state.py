@@ -9,7 +9,6 @@ from typing import NamedTuple
 from microdrivers.backends.pi_gcs.axis_map import AxisMap, by_axis
 from microdrivers.backends.pi_gcs.protocol import Gcs
 from microdrivers.backends.pi_gcs.replies import AxisStatus
-from microdrivers.devices.xytheta_stage import AXES
 
 
 class Findings(NamedTuple):
@@ -27,7 +26,7 @@ class Findings(NamedTuple):
 
 
 class ControllerState:
-    """Servo, reference and speed of each axis (x, y, theta) as last read or commanded.
+    """Servo, reference and speed of each of a controller's axes as last read or commanded.
 
     Several threads may read the stage at once: the first to see a change reports it, the others no longer do.
 
@@ -36,18 +35,20 @@ class ControllerState:
         referenced: whether the controller knows the reference of each axis (FRF?).
         dropped: axes at fault: their servo has switched itself off and nobody has cleared the fault.
         referencing: the axis under reference, whose servo and reference change by themselves.
+        changes: grows whenever servo or reference of an axis changes.
     """
 
     def __init__(self, gcs: Gcs, axis_maps: Mapping[str, AxisMap]) -> None:
-        self.servo_on = dict.fromkeys(AXES, False)
-        self.referenced = dict.fromkeys(AXES, False)
+        self.servo_on = dict.fromkeys(axis_maps, False)
+        self.referenced = dict.fromkeys(axis_maps, False)
         self.dropped: frozenset[str] = frozenset()
         self.referencing: str | None = None
+        self.changes = 0
         self._gcs = gcs
         self._axis_maps = axis_maps
         self._error_flag = False
-        self._speed_text = dict.fromkeys(AXES, "")
-        self._accepted_speed = dict.fromkeys(AXES, 0.0)
+        self._speed_text = dict.fromkeys(axis_maps, "")
+        self._accepted_speed = dict.fromkeys(axis_maps, 0.0)
         self._known_interruptions = -1
         self._lock = threading.Lock()  # comparing and noting is one step; never held during an exchange
 
@@ -58,14 +59,13 @@ class ControllerState:
 
     def contradicts(self, status: Mapping[str, AxisStatus]) -> bool:
         """Whether the status registers call for `examine`: a servo off, a new error flag, or doubt."""
+        error_flag = off = False
         with self._lock:
-            error_flag = any(axis_status.error_flag for axis_status in status.values())
+            for axis, axis_status in status.items():
+                error_flag |= axis_status.error_flag
+                off |= self.servo_on[axis] and not axis_status.servo_on and axis != self.referencing
             flag_is_new = error_flag and not self._error_flag
             self._error_flag = error_flag
-            off = any(
-                self.servo_on[axis] and not axis_status.servo_on and axis != self.referencing
-                for axis, axis_status in status.items()
-            )
         return off or flag_is_new or self.doubtful
 
     def examine(self) -> Findings:
@@ -76,10 +76,11 @@ class ControllerState:
         speeds = by_axis(self._axis_maps, self._gcs.numbers("VEL?"), command="VEL?")
         code = self._gcs.error()
         with self._lock:
-            steady = [axis for axis in AXES if axis != self.referencing]
+            steady = [axis for axis in self._axis_maps if axis != self.referencing]
             lost = [axis for axis in steady if self.referenced[axis] and not referenced[axis]]
             off = [axis for axis in steady if self.servo_on[axis] and not servo_on[axis]]
             dropped = [axis for axis in off if axis not in lost]
+            self.changes += (servo_on, referenced) != (self.servo_on, self.referenced)
             self.servo_on, self.referenced = servo_on, referenced
             self.dropped = self.dropped.union(dropped)
             for axis, axis_map in self._axis_maps.items():
@@ -96,10 +97,17 @@ class ControllerState:
             self.referencing = axis
             self.referenced = self.referenced | {axis: False}
 
+    def end_reference(self) -> None:
+        """Nothing changes by itself any more."""
+        with self._lock:
+            self.referencing = None
+            self.changes += 1
+
     def switched_on(self, axes: Iterable[str]) -> None:
         """The servos of these axes have been switched on."""
         with self._lock:
             self.servo_on = self.servo_on | dict.fromkeys(axes, True)
+            self.changes += 1
 
     def faster(self, speeds: Mapping[str, float]) -> dict[str, float]:
         """Those speeds that are higher than any that the controller is known to accept."""

@@ -1,4 +1,4 @@
-"""What is asked when the stage is opened: is it the controller of the rig file, and how far may it travel?
+"""What a controller is asked when the stage is opened: is it that of the rig file, and how far may it travel?
 
 Nothing here moves an axis or switches a servo.
 """
@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 from microdrivers.backends.pi_gcs.axis_map import AxisMap, by_axis
 from microdrivers.backends.pi_gcs.error_codes import STOPPED, meaning_of
-from microdrivers.backends.pi_gcs.protocol import Gcs
+from microdrivers.backends.pi_gcs.protocol import UNINTELLIGIBLE_REMEDY, Gcs
 from microdrivers.backends.pi_gcs.settings import GcsStageSettings
 from microdrivers.core.errors import ConfigError, LinkTimeout, OutOfRange, ProtocolError
 from microdrivers.core.units import Range
 from microdrivers.devices.base import DeviceInfo
-from microdrivers.devices.xytheta_stage import AXES
 
 _COPYRIGHT = re.compile(r"^\(c\)\s*\d{4}\s*", re.IGNORECASE)
 
@@ -41,14 +40,14 @@ def inspect(gcs: Gcs, settings: GcsStageSettings, axes: Mapping[str, AxisMap], *
     Args:
         gcs: the protocol on an open line.
         settings: the stage in the rig file.
-        axes: its axes as the rig file describes them, by x, y, theta.
+        axes: those that this controller drives, as the rig file describes them, by x, y, theta.
         name: of the device, for messages.
 
     Raises:
         LinkTimeout, ProtocolError: silence, garbage or another device.
         ConfigError: an axis, stage name, unit or limit of the rig file contradicts the controller.
     """
-    info = _identify(gcs, settings)
+    info = _identify(gcs, settings, _wanted_serial_number(gcs, settings, axes))
     code = gcs.error()
     if code:
         # Every orderly end of use stops the controller, which it remembers as an error.
@@ -70,29 +69,39 @@ def inspect(gcs: Gcs, settings: GcsStageSettings, axes: Mapping[str, AxisMap], *
     return Opened(info, found, status_index)
 
 
-def _identify(gcs: Gcs, settings: GcsStageSettings) -> DeviceInfo:
+def _wanted_serial_number(gcs: Gcs, settings: GcsStageSettings, axes: Mapping[str, AxisMap]) -> str | None:
+    if gcs.address is None:
+        return settings.serial_number
+    (axis,) = axes
+    serial_number: str | None = getattr(settings.axes, axis).serial_number
+    return serial_number
+
+
+def _identify(gcs: Gcs, settings: GcsStageSettings, wanted_serial_number: str | None) -> DeviceInfo:
     port, baudrate = settings.connection.port, settings.connection.baudrate
     try:
         identity = gcs.identify()
     except (LinkTimeout, ProtocolError) as error:
-        error.remedy = (
+        baud = (
             f"check power, cable and baud rate: a wrong rate looks like garbage or silence; the rig file says "
             f"{baudrate}, the controller's DIP switches or parameters say which it uses"
         )
+        special = isinstance(error, ProtocolError) and error.remedy != UNINTELLIGIBLE_REMEDY
+        error.remedy = f"{error.remedy}; {baud}" if special else baud
         raise
     fields = [field.strip() for field in identity.split(",")]
     if settings.controller not in identity or len(fields) < 4:
         raise ProtocolError(
             f"another device behind the port: {identity[:80]!r} on {port} is no {settings.controller}",
-            sent=b"*IDN?\n", received=identity.encode("latin-1"),
+            sent=gcs.request("*IDN?"), received=identity.encode("latin-1"),
             remedy="check connection.port and controller in the rig file",
         )  # fmt: skip
     vendor, model, serial_number, firmware = fields[-4:]
-    if settings.serial_number is not None and settings.serial_number != serial_number:
+    if wanted_serial_number is not None and wanted_serial_number != serial_number:
         raise ProtocolError(
             f"another device behind the port: {model} on {port} has serial number {serial_number}, "
-            f"not {settings.serial_number}",
-            sent=b"*IDN?\n", received=identity.encode("latin-1"),
+            f"not {wanted_serial_number}",
+            sent=gcs.request("*IDN?"), received=identity.encode("latin-1"),
             remedy="check connection.port and serial_number in the rig file",
         )  # fmt: skip
     return DeviceInfo(
@@ -121,7 +130,7 @@ def _find_axes(gcs: Gcs, axes: Mapping[str, AxisMap], name: str) -> dict[str, in
 
 def _check_stage_names(gcs: Gcs, settings: GcsStageSettings, axes: Mapping[str, AxisMap], name: str) -> None:
     reported = by_axis(axes, gcs.texts("CST?"), command="CST?")
-    for axis in AXES:
+    for axis in axes:
         wanted = getattr(settings.axes, axis).stage
         if wanted is not None and wanted != reported[axis]:
             raise ConfigError(

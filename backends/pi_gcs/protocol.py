@@ -4,28 +4,32 @@ Set commands have no reply, so each is followed by `ERR?` in the same write: one
 number belongs to the command. A set command is never repeated. A query changes nothing and is repeated once
 if its reply did not come (not `ERR?`: reading it clears it). `MVR` is never used: a relative move whose reply
 is lost has no known end.
+
+In a daisy chain every request begins with the address of the controller that it is for, and the first line of
+every reply with `0` (the host) and the address that it comes from. Single bytes are then sent in a line of their own.
+Only one controller is asked at a time, so that an answer of another one is always a late or a misplaced one.
 """
 
 from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 from microdrivers.backends.lines.serial_line import Exchange, SerialLine
 from microdrivers.backends.pi_gcs import error_codes, replies
-from microdrivers.core.errors import LinkError, LinkTimeout, MoveCancelled, ProtocolError
+from microdrivers.core.errors import LinkError, LinkTimeout, MicrodriversError, MoveCancelled, ProtocolError
 
 STATUS_REGISTER = "\x04"
 REQUEST_READY = "\x07"
-STOP_ALL = b"\x18"
+STOP_ALL = "\x18"
 
 _READY = {"\xb1": True, "\xb0": False}
-_SINGLE_BYTE = (STATUS_REGISTER, REQUEST_READY)
-_POSITIONS = b"POS?\n"
+_SINGLE_BYTE = (STATUS_REGISTER, REQUEST_READY, STOP_ALL)
+_POSITIONS = "POS?"
 
-_UNINTELLIGIBLE_REMEDY = (
+UNINTELLIGIBLE_REMEDY = (
     "check the baud rate (a wrong one gives garbage or silence), the cable, and that nothing else uses this line"
 )
 
@@ -38,8 +42,8 @@ class Pose(NamedTuple):
     """Positions and status registers, asked for in one write.
 
     `positions` are in the controller's units (mm, deg) by axis id, `status` is in the order of its axes. The
-    times are ns on the rig's clock: when the write began, when the last bit of `POS?` had left, and when the
-    first byte of the reply was seen.
+    times are ns on the rig's clock: when the write began, when the last bit of `POS?` had left, when the first byte
+    of the reply was seen, and the last.
     """
 
     positions: dict[str, float]
@@ -47,25 +51,42 @@ class Pose(NamedTuple):
     start_ns: int
     asked_ns: int
     first_byte_ns: int
+    end_ns: int
 
 
 class Gcs:
     """One GCS 2.0 controller at the end of a line, which it does not open or close.
 
+    Args:
+        address: of the controller in a daisy chain, 1 to 16; None if it has the line to itself.
+
     Attributes:
         identity: the answer to `*IDN?`, once `identify()` has been called.
         interruptions: how many exchanges have failed; whoever sees it change should doubt what he knew.
         stops: changes whenever a stop is sent.
+        neighbours: the other controllers on the same line.
     """
 
-    def __init__(self, line: SerialLine) -> None:
+    def __init__(self, line: SerialLine, *, address: int | None = None) -> None:
+        self.address = address
         self.identity = ""
         self.interruptions = 0
         self.stops = 0
+        self.neighbours: Sequence[Gcs] = ()
         self._line = line
+        self._pose_request = self.request(_POSITIONS, STATUS_REGISTER)
+        self._positions_end = len(self.request(_POSITIONS))
         self._stop_numbers = itertools.count(1)
         self._error_pending = False
         self._suspect = False
+
+    def request(self, *commands: str) -> bytes:
+        """These commands as they go on the line."""
+        if self.address is not None:
+            lines = (f"{self.address} {command}\n" for command in commands)
+        else:
+            lines = (command if command in _SINGLE_BYTE else f"{command}\n" for command in commands)
+        return "".join(lines).encode("ascii")
 
     # ------------------------------------------------------------------ queries
 
@@ -105,12 +126,12 @@ class Gcs:
 
     def pose(self) -> Pose:
         """Positions and status in one write, so that they belong together."""
-        return self._patiently(self._pose)
+        return self._patiently(self._pose, self._pose_request)
 
     def error(self) -> int:
         """The controller's last error number, which this clears. Never repeated."""
         self._error_pending = False
-        return self._ask(b"ERR?\n", 1, _error_code)
+        return self._ask(self.request("ERR?"), 1, _error_code)
 
     # ------------------------------------------------------------------ commands
 
@@ -122,7 +143,11 @@ class Gcs:
         """
         code = self.attempt(*lines)
         if code:
-            raise error_codes.error_from(code, sent=_text(*lines))
+            raise self.refusal(code, *lines)
+
+    def refusal(self, code: int, *lines: str) -> MicrodriversError:
+        """What the controller's error number says about these commands, ready to be raised."""
+        return error_codes.error_from(code, sent=self.request(*lines))
 
     def attempt(self, *lines: str) -> int:
         """As `command`, but return the error number (0 if none) of the last line that failed.
@@ -132,26 +157,35 @@ class Gcs:
         """
         stops, stale = self.stops, self._error_pending
         self._error_pending = False
-        request = (b"ERR?\n" if stale else b"") + _text(*lines, "ERR?")
+        request = self.request(*(["ERR?"] if stale else []), *lines, "ERR?")
         codes: list[int] = self._ask(request, 1 + stale, lambda *found: [_error_code(reply) for reply in found])
         if stale and codes[0] not in (error_codes.NO_ERROR, error_codes.STOPPED):
             _log.warning("an earlier error %d (%s) was pending", codes[0], error_codes.meaning_of(codes[0]))
         if self.stops != stops:
             raise MoveCancelled(
-                f"a stop was sent while {_text(*lines)!r} was under way",
+                f"a stop was sent while {self.request(*lines)!r} was under way",
                 remedy="check why the stop was requested, read the position, then command a new move",
                 moved="maybe",
             )
         return codes[-1]
 
     def stop(self) -> None:
-        """Stop all axes abruptly (#24): from any thread, past an exchange under way, awaiting nothing."""
+        """Stop all axes of all controllers on the line abruptly (#24), in one write.
+
+        From any thread, past an exchange under way, awaiting nothing.
+        """
+        # HLT is not used, neither here nor for one controller of a chain: it is a line among others, which a controller
+        # works off in its turn, while #24 is served at once, also during a reference move, and needs no axis. Its line
+        # feed in a chain leaves nothing in any controller's buffer that could spoil the next request.
+        controllers = (self, *self.neighbours)
         # Before and after: whoever begins or ends an exchange while this is sent must notice it.
-        self._note_stop()
+        for gcs in controllers:
+            gcs._note_stop()
         try:
-            self._line.send_now(STOP_ALL)
+            self._line.send_now(b"".join(gcs.request(STOP_ALL) for gcs in controllers))
         finally:
-            self._note_stop()
+            for gcs in controllers:
+                gcs._note_stop()
 
     # ------------------------------------------------------------------ inside
 
@@ -159,26 +193,26 @@ class Gcs:
         self.stops = next(self._stop_numbers)
         self._error_pending = True
 
-    def _pose(self) -> Pose:
-        request = _POSITIONS + STATUS_REGISTER.encode()
+    def _pose(self, request: bytes) -> Pose:
         exchange, (positions, status) = self._ask_timed(request, 2, _positions_and_status)
-        wire_ns = exchange.request_end_ns - exchange.request_start_ns
-        asked_ns = exchange.request_start_ns + wire_ns * len(_POSITIONS) // len(request)
-        return Pose(positions, status, exchange.request_start_ns, asked_ns, exchange.first_byte_ns)
+        start_ns = exchange.request_start_ns
+        wire_ns = exchange.request_end_ns - start_ns
+        asked_ns = start_ns + wire_ns * self._positions_end // len(request)
+        return Pose(positions, status, start_ns, asked_ns, exchange.first_byte_ns, exchange.end_ns)
 
     def _query(self, command: str, parse: Callable[[replies.Reply], ResultT]) -> ResultT:
-        request = (command if command in _SINGLE_BYTE else f"{command}\n").encode("ascii")
-        return self._patiently(lambda: self._ask(request, 1, parse))
+        request = self.request(command)
+        return self._patiently(lambda request: self._ask(request, 1, parse), request)
 
-    def _patiently(self, ask: Callable[[], ResultT]) -> ResultT:
+    def _patiently(self, ask: Callable[[bytes], ResultT], request: bytes) -> ResultT:
         """Ask; if no answer comes find out why, and if the controller does not know either, ask once more."""
         try:
-            return ask()
+            return ask(request)
         except LinkTimeout as silence:
-            self._explain(silence)
-        return ask()
+            self._explain(silence, request)
+        return ask(request)
 
-    def _explain(self, silence: LinkTimeout) -> None:
+    def _explain(self, silence: LinkTimeout, request: bytes) -> None:
         """A refused query has no reply; its reason waits in ERR?."""
         if not self.identity:
             return
@@ -187,7 +221,7 @@ class Gcs:
         except LinkTimeout:
             raise silence from None
         if code not in (error_codes.NO_ERROR, error_codes.STOPPED):
-            raise error_codes.error_from(code) from silence
+            raise error_codes.error_from(code, sent=request) from silence
 
     def _ask(self, request: bytes, count: int, parse: Callable[..., ResultT]) -> ResultT:
         return self._ask_timed(request, count, parse)[1]
@@ -202,24 +236,30 @@ class Gcs:
             self._interrupted()
             raise
         try:
-            return exchange, parse(*replies.split_replies(exchange.reply, count))
+            found = replies.split_replies(exchange.reply, count)
+            if self.address is not None:
+                found = [replies.without_address(reply, self.address) for reply in found]
+            return exchange, parse(*found)
         except ProtocolError as error:
             self._interrupted()
             raise ProtocolError(
                 f"unintelligible reply: {error.what}",
-                sent=request, received=exchange.reply, remedy=_UNINTELLIGIBLE_REMEDY,
+                sent=request, received=exchange.reply, remedy=error.remedy or UNINTELLIGIBLE_REMEDY,
             ) from None  # fmt: skip
 
     def _resynchronise(self) -> None:
         """Ask for the identity and read until it comes: what comes before it answers earlier requests."""
         if self.identity:
-            last_line = self.identity.encode("latin-1") + b"\n"
-            self._line.exchange(b"*IDN?\n", lambda received: received.endswith(last_line))
+            sender = "" if self.address is None else f"0 {self.address} "
+            last_line = f"{sender}{self.identity}\n".encode("latin-1")
+            self._line.exchange(self.request("*IDN?"), lambda received: received.endswith(last_line))
         self._suspect = False
 
     def _interrupted(self) -> None:
         self.interruptions += 1
         self._suspect = self._error_pending = True
+        for gcs in self.neighbours:  # what is still on its way would come when they are asked
+            gcs._suspect = True
 
 
 def _ready(reply: replies.Reply) -> bool:
@@ -240,7 +280,3 @@ def _positions_and_status(
 
 def _error_code(reply: replies.Reply) -> int:
     return replies.integer(replies.single(reply))
-
-
-def _text(*lines: str) -> bytes:
-    return "".join(f"{line}\n" for line in lines).encode("ascii")

@@ -19,7 +19,8 @@ _NUMBER = re.compile(r"[+-]?(\d{1,40}(\.\d{0,40})?|\.\d{1,40})([eE][+-]?\d{1,4})
 _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _STATUS = re.compile(r"0[xX]((?:[0-9A-Fa-f]{4})+)", re.ASCII)
 _ASSIGNMENT = re.compile(r"([A-Za-z0-9_]{1,16})=(.*)", re.ASCII)
-_PRINTABLE = re.compile(r"[\x20-\x7e\xa0-\xff]*")
+_ADDRESSED = re.compile(r"(\d{1,3}) (\d{1,3}) (.*)", re.ASCII)
+_PRINTABLE = re.compile(r"[\x20-\x7e\xa0-\xff\n]*")
 
 ValueT = TypeVar("ValueT")
 
@@ -39,7 +40,7 @@ class AxisStatus(NamedTuple):
     @classmethod
     def from_word(cls, word: int) -> AxisStatus:
         """Bits 15, 14, 13, 12 and 8 of the register."""
-        return cls(*(bool(word >> bit & 1) for bit in (15, 14, 13, 12, 8)))
+        return cls(word & 0x8000 > 0, word & 0x4000 > 0, word & 0x2000 > 0, word & 0x1000 > 0, word & 0x0100 > 0)
 
 
 def completed_after(count: int) -> Callable[[bytes], bool]:
@@ -56,16 +57,38 @@ def split_replies(received: bytes, count: int) -> list[Reply]:
     if not received.endswith(b"\n") or _count_replies(received) != count:
         raise ProtocolError(f"{count} whole replies were expected")
     text = received.decode("latin-1")
+    if not _PRINTABLE.fullmatch(text):
+        raise ProtocolError("the reply is no text")
     replies: list[Reply] = []
     lines: list[str] = []
     for line in text.removesuffix("\n").split("\n"):
-        if not _PRINTABLE.fullmatch(line):
-            raise ProtocolError("the reply is no text")
         lines.append(line.removesuffix(" "))
         if not line.endswith(" "):
             replies.append(lines)
             lines = []
     return replies
+
+
+def without_address(reply: Reply, address: int) -> Reply:
+    """A reply in a daisy chain without `0` and the sender's address, which stand before its first line only.
+
+    Raises:
+        ProtocolError: there is none, or it is another controller's.
+    """
+    match = _ADDRESSED.fullmatch(reply[0])
+    if match is None:
+        raise ProtocolError(
+            f"no address is in front of it, where '0 {address} ' was expected",
+            remedy="check that this is a GCS 2.0 controller in a daisy chain; without a chain, give no address",
+        )
+    to, sender = int(match[1]), int(match[2])
+    if (to, sender) != (0, address):
+        raise ProtocolError(
+            f"address {address} was asked, and the answer is from address {sender} to {to}",
+            remedy="check that DIP switches 1-4 give each controller of the chain an address of its own, and that "
+            "nothing else uses this line",
+        )
+    return [match[3], *reply[1:]]
 
 
 def single(reply: Reply) -> str:

@@ -1,4 +1,4 @@
-"""Rig-file settings of a PI XYθ stage on a GCS 2.0 controller."""
+"""Rig-file settings of a PI XYθ stage on one GCS 2.0 controller, or on three in a daisy chain."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ class _Axis(DeviceSettings):
     """What a linear and a rotary axis have in common.
 
     `id` is the controller's axis identifier; `stage` the name that `CST?` must report; `direction` is −1 if
-    the controller's positive sense is the rig's negative one.
+    the controller's positive sense is the rig's negative one. `address` is that of the axis' own controller in a
+    daisy chain (DIP switches 1-4), which may have to have a `serial_number`.
     """
 
-    id: str = pydantic.Field(pattern=r"^[A-Za-z0-9_]{1,16}$")
+    id: str = pydantic.Field(default="1", pattern=r"^[A-Za-z0-9_]{1,16}$")
+    address: int | None = pydantic.Field(default=None, ge=1, le=16)
+    serial_number: str | None = None
     stage: str | None = None
     direction: Literal[1, -1] = 1
     reference: ReferenceMode = "FRF"
@@ -57,17 +60,35 @@ class RotaryAxis(_Axis):
 
 
 class StageAxes(DeviceSettings):
-    """The three axes of the stage."""
+    """The three axes of the stage: all on one controller, or each on one of its own, with an address."""
 
     x: LinearAxis
     y: LinearAxis
     theta: RotaryAxis
 
+    @property
+    def chained(self) -> bool:
+        """Whether each axis has a controller of its own in a daisy chain."""
+        return self.x.address is not None
+
     @pydantic.model_validator(mode="after")
     def _distinct(self) -> StageAxes:
-        ids = [self.x.id, self.y.id, self.theta.id]
+        axes = (self.x, self.y, self.theta)
+        addresses = [axis.address for axis in axes]
+        if None not in addresses:
+            if len(set(addresses)) != len(axes):
+                raise ValueError(f"the three controllers of a daisy chain need different addresses, not {addresses}")
+            return self
+        if any(addresses):
+            raise ValueError(
+                f"addresses are {addresses}: give one to each axis (three controllers in a daisy chain) or to none "
+                "(one controller for all axes)"
+            )
+        ids = [axis.id for axis in axes]
         if len(set(ids)) != len(ids):
             raise ValueError(f"the three axes need different controller axis ids, not {ids}")
+        if any(axis.serial_number is not None for axis in axes):
+            raise ValueError("only an axis with an address has a serial_number: give it for the stage, not per axis")
         return self
 
 
@@ -83,7 +104,10 @@ class PositionLatch(DeviceSettings):
 
 
 class GcsStageSettings(DeviceSettings):
-    """An XYθ stage on one multi-axis GCS 2.0 controller (C-884 class)."""
+    """An XYθ stage on one multi-axis GCS 2.0 controller (C-884 class) or on three of one axis (C-863.11, C-863.12).
+
+    `controller` is the model that each of them must report.
+    """
 
     driver: Literal["pi-gcs-xytheta"] = "pi-gcs-xytheta"
     connection: SerialConnection
@@ -93,6 +117,14 @@ class GcsStageSettings(DeviceSettings):
     latch: PositionLatch = PositionLatch()
     settle_s: float = pydantic.Field(default=0.2, gt=0)
     reference_timeout_s: float = pydantic.Field(default=60.0, gt=0)
+
+    @pydantic.model_validator(mode="after")
+    def _whose_serial_number(self) -> GcsStageSettings:
+        if self.axes.chained and self.serial_number is not None:
+            raise ValueError(
+                "each controller of a daisy chain has its own serial_number: give it per axis, not for the stage"
+            )
+        return self
 
 
 def _check(travel: Range, resolution: float, tolerance: float, unit: str) -> None:

@@ -1,49 +1,41 @@
-"""The XYθ stage on a GCS 2.0 controller."""
+"""The XYθ stage on GCS 2.0 controllers."""
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from microdrivers.backends.lines.serial_line import SerialLine
-from microdrivers.backends.pi_gcs import error_codes
-from microdrivers.backends.pi_gcs.axis_map import AxisMap, by_axis
-from microdrivers.backends.pi_gcs.controller_state import ControllerState
-from microdrivers.backends.pi_gcs.identification import inspect
-from microdrivers.backends.pi_gcs.protocol import Gcs, Pose
-from microdrivers.backends.pi_gcs.replies import AxisStatus
+from microdrivers.backends.pi_gcs.axis_map import AxisMap
+from microdrivers.backends.pi_gcs.chain_pose import PoseReader
+from microdrivers.backends.pi_gcs.controller import Controller, Reading
+from microdrivers.backends.pi_gcs.protocol import Gcs
+from microdrivers.backends.pi_gcs.referencing import ReferenceSearch
 from microdrivers.backends.pi_gcs.settings import GcsStageSettings
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import (
-    DeviceFault,
-    MicrodriversError,
-    MoveCancelled,
-    NotReached,
-    NotReferenced,
-    ProtocolError,
-)
-from microdrivers.core.samples import TimeSource, XYThetaSample
-from microdrivers.core.units import NS_PER_MS, seconds_to_ns
+from microdrivers.core.errors import DeviceFault, LinkError, MicrodriversError, MoveCancelled, RefusedError
+from microdrivers.core.samples import XYThetaSample
 from microdrivers.devices.base import DeviceInfo
 from microdrivers.devices.wire_tap import WireTap
 from microdrivers.devices.xytheta_stage import AXES, XYThetaStage
 
 FAULT_FLAG = "FAULT"
 
-_REFERENCE_POLL_S = 0.05
-
-_log = logging.getLogger(__name__)
-
 
 class GcsXYThetaStage(XYThetaStage):
-    """Three axes of one multi-axis GCS 2.0 controller (C-884 class).
+    """Three axes of one multi-axis GCS 2.0 controller (C-884 class), or of three in a daisy chain (C-863.12 class).
 
-    Positions and status of all axes come from one write and are stamped at the instant at which the controller
-    samples them: the end of the request plus `latch.delay_ms`. The first move of a referenced axis switches its
-    servo on. A servo that drops by itself is a fault until `clear_fault()`; until then samples carry the flag
-    `FAULT`. A controller that has forgotten its reference (power cycle) gives the event `reference_lost`.
+    Positions and status of a controller's axes come from one write and are stamped at the instant at which it samples
+    them: the end of the request plus `latch.delay_ms`. How those of a chain become one pose stands in `chain_pose`.
+
+    The controllers of a chain are sent their moves one after the other: each axis starts when the command of the one
+    before has been answered, about 5 ms later at 115200 baud. A path at 1 mm/s is therefore off by about 5 µm until the
+    axes come to rest, where it is not. A stop is one write for all.
+
+    The first move of a referenced axis switches its servo on. A servo that drops by itself is a fault until
+    `clear_fault()`; until then samples carry the flag `FAULT`. A controller that has forgotten its reference (power
+    cycle) gives the event `reference_lost`; the axes of the others keep theirs.
     """
 
     def __init__(self, name: str, settings: GcsStageSettings, *, clock: Clock, bus: Bus) -> None:
@@ -51,23 +43,34 @@ class GcsXYThetaStage(XYThetaStage):
         self.settle_s = settings.settle_s
         self._settings = settings
         self._line = SerialLine(settings.connection, clock=clock, tap=WireTap(name, bus))
-        self._gcs = Gcs(self._line)
-        self._latch_delay_ns = round(settings.latch.delay_ms * NS_PER_MS)
-        self._latch_dt_ns = round(settings.latch.uncertainty_ms * NS_PER_MS)
-        self._rig_axes = {axis: AxisMap.from_settings(getattr(settings.axes, axis)) for axis in AXES}
-        self._adopt(self._rig_axes, {})
+        self._controllers = self._make_controllers()
+        self._poses = PoseReader(self._ask_all)
+        self._adopt_limits()
 
-    def _adopt(self, axis_maps: Mapping[str, AxisMap], status_index: Mapping[str, int]) -> None:
-        self._axis_maps = axis_maps
-        self._status_index = status_index
-        self._state = ControllerState(self._gcs, axis_maps)
-        self._targets = dict.fromkeys(AXES, math.nan)
-        self.axes = {axis: axis_map.spec for axis, axis_map in axis_maps.items()}
+    def _make_controllers(self) -> tuple[Controller, ...]:
+        settings = {axis: getattr(self._settings.axes, axis) for axis in AXES}
+        groups = [(axis,) for axis in AXES] if self._settings.axes.chained else [AXES]
+        languages = [Gcs(self._line, address=settings[group[0]].address) for group in groups]
+        for gcs in languages:
+            gcs.neighbours = [other for other in languages if other is not gcs]
+        return tuple(
+            Controller(
+                gcs,
+                {axis: AxisMap.from_settings(settings[axis]) for axis in group},
+                self._settings,
+                name=self.name,
+                reference_lost=lambda reason: self._publish_event("reference_lost", reason=reason),
+            )
+            for gcs, group in zip(languages, groups, strict=True)
+        )
+
+    def _adopt_limits(self) -> None:
+        self.axes = {axis: found.spec for controller in self._controllers for axis, found in controller.axes.items()}
 
     @property
     def referenced(self) -> Mapping[str, bool]:
-        """Whether the reference of each axis is known, as the controller last reported (FRF?)."""
-        return dict(self._state.referenced)
+        """Whether the reference of each axis is known, as its controller last reported (FRF?)."""
+        return {axis: known for controller in self._controllers for axis, known in controller.state.referenced.items()}
 
     # ------------------------------------------------------------------ life
 
@@ -76,13 +79,13 @@ class GcsXYThetaStage(XYThetaStage):
 
     def _identify(self) -> DeviceInfo:
         try:
-            found = inspect(self._gcs, self._settings, self._rig_axes, name=self.name)
-            self._adopt(found.axes, found.status_index)
-            self._examine()
+            found = [controller.identify() for controller in self._controllers]
         except MicrodriversError as error:
             error.moved = "no"
             raise
-        return found.info
+        self._poses = PoseReader(self._ask_all)
+        self._adopt_limits()
+        return _joined(found)
 
     @property
     def line_counters(self) -> Mapping[str, int]:
@@ -91,231 +94,159 @@ class GcsXYThetaStage(XYThetaStage):
 
     def _close(self) -> None:
         self._line.close()
-        self._state = ControllerState(self._gcs, self._axis_maps)
+        for controller in self._controllers:
+            controller.forget()
 
     def _stop(self) -> None:
-        self._gcs.stop()
-        self._forget_targets(AXES)
+        self._controllers[0].gcs.stop()
+        for controller in self._controllers:
+            controller.forget_targets()
 
     def _clear_fault(self) -> None:
-        code = self._gcs.error()
-        if code:
-            _log.info("%s: error %d (%s) cleared", self.name, code, error_codes.meaning_of(code))
-        self._examine()
-        self._state.dropped = frozenset()
+        _each(self._controllers, Controller.clear_fault)
 
     # ------------------------------------------------------------------ reading
 
     def _read(self) -> XYThetaSample:
-        pose = self._gcs.pose()
-        positions = by_axis(self._axis_maps, pose.positions, command="POS?")
-        status = self._status_by_axis(pose)
-        if self._state.contradicts(status):
-            self._examine()
-        t_ns, dt_ns, source = self._stamp(pose)
-        in_servo = [axis_status for axis_status in status.values() if axis_status.servo_on]
-        targets = self._targets
+        pose = self._poses.read()
+        status = pose.status.values()
+        in_servo = [axis_status for axis_status in status if axis_status.servo_on]
+        targets = self._still_valid(pose.targets)
         return XYThetaSample(
-            t_ns=t_ns,
-            dt_ns=dt_ns,
-            t_source=source,
+            t_ns=pose.t_ns,
+            dt_ns=pose.dt_ns,
+            t_source=pose.source,
             device=self.name,
             seq=self._next_seq(),
-            flags=frozenset({FAULT_FLAG}) if self._state.dropped else frozenset(),
-            x_um=self._axis_maps["x"].position(positions["x"]),
-            y_um=self._axis_maps["y"].position(positions["y"]),
-            theta_deg=self._axis_maps["theta"].position(positions["theta"]),
+            flags=frozenset({FAULT_FLAG} if any(found.state.dropped for found in self._controllers) else ()),
+            x_um=pose.positions["x"],
+            y_um=pose.positions["y"],
+            theta_deg=pose.positions["theta"],
             target_x_um=targets["x"],
             target_y_um=targets["y"],
             target_theta_deg=targets["theta"],
-            moving=any(axis_status.moving or axis_status.referencing for axis_status in status.values()),
+            moving=any(axis_status.moving or axis_status.referencing for axis_status in status),
             # An axis without servo holds no target and is never "on" it; the others decide.
             on_target=bool(in_servo) and all(axis_status.on_target for axis_status in in_servo),
-            referenced=all(self._state.referenced.values()),
+            referenced=all(all(found.state.referenced.values()) for found in self._controllers),
         )
 
-    def _status_by_axis(self, pose: Pose) -> dict[str, AxisStatus]:
-        if len(pose.status) <= max(self._status_index.values()):
-            raise ProtocolError(
-                f"the status reply has {len(pose.status)} registers, fewer than when the stage was opened",
-                remedy="close and open the stage again",
-            )
-        return {axis: pose.status[index] for axis, index in self._status_index.items()}
+    def _still_valid(self, targets: Mapping[str, float]) -> dict[str, float]:
+        """The targets without those that have been given up while the axes were asked."""
+        given_up = [
+            axis
+            for controller in self._controllers
+            for axis, target in controller.targets.items()
+            if math.isnan(target)
+        ]
+        return {**targets, **dict.fromkeys(given_up, math.nan)}
 
-    def _stamp(self, pose: Pose) -> tuple[int, int, TimeSource]:
-        """When the controller sampled the positions."""
-        latched_ns = pose.asked_ns + self._latch_delay_ns
-        if latched_ns < pose.first_byte_ns:
-            return latched_ns, self._latch_dt_ns, "request"
-        # By the baud rate the request had not ended when the reply began: a port that has none (USB, TCP).
-        half_ns = (pose.first_byte_ns - pose.start_ns) // 2
-        return pose.start_ns + half_ns, half_ns, "midpoint"
-
-    def _examine(self) -> int:
-        """Ask the controller what has changed without being commanded; returns its error number.
-
-        Raises:
-            DeviceFault: the controller reports a fault, or a servo has dropped by itself.
-        """
-        found = self._state.examine()
-        self._forget_targets((*found.lost, *found.dropped))
-        if found.lost:
-            axes = ", ".join(found.lost)
-            reason = f"the controller no longer knows the reference of axis {axes}: was it switched off?"
-            _log.warning("%s: %s", self.name, reason)
-            self._publish_event("reference_lost", reason=reason)
-        if error_codes.is_fault(found.code):
-            raise error_codes.error_from(found.code)
-        if found.dropped:
-            raise _servo_fault(found.dropped, found.code)
-        if found.code not in (error_codes.NO_ERROR, error_codes.STOPPED):
-            meaning = error_codes.meaning_of(found.code)
-            _log.warning("%s: error %d (%s) was pending", self.name, found.code, meaning)
-        return found.code
-
-    def _forget_targets(self, axes: Iterable[str]) -> None:
-        self._targets = self._targets | dict.fromkeys(axes, math.nan)
+    def _ask_all(self) -> Sequence[Reading]:
+        """One reading of each controller, in turn; what contradicts expectation is looked into."""
+        readings = [controller.read() for controller in self._controllers]
+        doubtful = [
+            controller
+            for controller, reading in zip(self._controllers, readings, strict=True)
+            if controller.contradicted_by(reading)
+        ]
+        _each(doubtful, Controller.examine)
+        return readings
 
     # ------------------------------------------------------------------ moving
 
     def _start_move(self, targets: Mapping[str, float], speeds: Mapping[str, float]) -> None:
-        stops = self._gcs.stops
-        self._ensure_servo(targets)
-        self._ensure_accepted(self._state.faster(speeds))
-        if self._gcs.stops != stops:
-            raise MoveCancelled("a stop was sent while the move was being prepared", moved="no")
-        changed = self._state.changed(self._speed_texts(speeds))
-        positions = {axis: self._axis_maps[axis].target_text(target) for axis, target in targets.items()}
-        lines = [self._line_for("VEL", changed)] if changed else []
-        lines.append(self._line_for("MOV", positions))
-        self._state.speeds_sent(changed)
-        code = self._gcs.attempt(*lines)
-        if code:
-            self._raise_refusal(code, targets, lines)
-        self._state.speeds_taken(changed, speeds)
-        self._targets = self._targets | dict(targets)
+        stops = self._stops
+        parts = [
+            (controller, axes)
+            for controller in self._controllers
+            if (axes := [axis for axis in controller.axes if axis in targets])
+        ]
+        try:
+            for controller, axes in parts:
+                controller.check(axes)
+            for controller, axes in parts:
+                controller.prepare(_only(axes, speeds))
+            if self._stops != stops:
+                raise MoveCancelled("a stop was sent while the move was being prepared")
+        except MicrodriversError as error:
+            error.moved = "no"
+            raise
+        begun: list[str] = []
+        for controller, axes in parts:
+            try:
+                controller.start(_only(axes, targets), _only(axes, speeds))
+                begun += axes
+                if self._stops != stops:
+                    raise MoveCancelled("a stop was sent while the move was being started")
+            except MicrodriversError as error:
+                self._give_up(error, begun, stopped=self._stops != stops)
+                raise
 
-    def _ensure_servo(self, targets: Mapping[str, float]) -> None:
-        """Switch on the servos that are off.
+    @property
+    def _stops(self) -> int:
+        """Changes before and after every stop that is sent, to whichever controller."""
+        return self._controllers[0].gcs.stops
 
-        An unexpected "off" may mean a power cycle, so the reference is asked for first.
+    def _give_up(self, error: MicrodriversError, begun: Sequence[str], *, stopped: bool) -> None:
+        """A move could not be started on all of its axes: stop those that may move, and say so in the error.
+
+        Raises:
+            MoveCancelled: instead of an error that stands for nothing having moved.
         """
-        if self._state.doubtful or not all(self._state.servo_on[axis] for axis in targets):
-            self._examine()
-            self._require_referenced(targets)
-        self._refuse_at_fault(targets)
-        off = [axis for axis in targets if not self._state.servo_on[axis]]
-        if off:
-            self._gcs.command(self._line_for("SVO", dict.fromkeys(off, "1")))
-            self._state.switched_on(off)
-
-    def _ensure_accepted(self, speeds: Mapping[str, float]) -> None:
-        """Send speeds that the controller may refuse ahead of the move, which would go on at the old one."""
-        if speeds:
-            texts = self._speed_texts(speeds)
-            self._state.speeds_sent(texts)
-            self._gcs.command(self._line_for("VEL", texts))
-            self._state.speeds_taken(texts, speeds)
-
-    def _raise_refusal(self, code: int, targets: Mapping[str, float], lines: Sequence[str]) -> None:
-        """Raise what a refused move means."""
-        refusal = error_codes.error_from(code, sent="\n".join(lines).encode())
-        if code == error_codes.MOVE_NOT_ALLOWED:
-            self._examine()
-            self._require_referenced(targets)
-            raise refusal
-        if code != error_codes.POSITION_OUT_OF_LIMITS and len(lines) > 1:
-            # VEL was refused, and MOV may be running at a speed that nobody asked for.
-            XYThetaStage.stop(self, by="driver", reason=refusal.what)
-            raise DeviceFault(
-                f"{refusal.what}; stopped, for the stage may have begun to move at another speed",
-                code=code, text=error_codes.meaning_of(code), remedy=refusal.remedy,
-            )  # fmt: skip
-        raise refusal
-
-    def _require_referenced(self, axes: Iterable[str]) -> None:
-        unknown = [axis for axis in axes if not self._state.referenced[axis]]
-        if unknown:
-            raise NotReferenced(
-                f"the controller no longer knows the reference of axis {', '.join(unknown)}",
-                remedy=f"make sure that the way is free, then reference({unknown!r})",
-            )
-
-    def _refuse_at_fault(self, axes: Iterable[str]) -> None:
-        dropped = [axis for axis in axes if axis in self._state.dropped]
-        if dropped:
-            fault = _servo_fault(dropped)
-            fault.moved = "no"
-            raise fault
-
-    def _speed_texts(self, speeds: Mapping[str, float]) -> dict[str, str]:
-        return {axis: self._axis_maps[axis].speed_text(speed) for axis, speed in speeds.items()}
-
-    def _line_for(self, mnemonic: str, texts: Mapping[str, str]) -> str:
-        pairs = (f"{self._axis_maps[axis].id} {texts[axis]}" for axis in AXES if axis in texts)
-        return f"{mnemonic} {' '.join(pairs)}"
+        # A stop that was sent meanwhile may have come before the last command: it needs another one.
+        if not (stopped or begun or isinstance(error, DeviceFault)):
+            return
+        try:
+            XYThetaStage.stop(self, by="driver", reason=f"a move could not be started: {error.what}")
+            end = "stopped"
+        except LinkError:
+            end = "could not be stopped"
+        if not begun:
+            return
+        error.what += f"; axis {', '.join(begun)} had begun to move and {end}"
+        error.moved = "yes"
+        if isinstance(error, RefusedError):
+            raise MoveCancelled(error.what, remedy=error.remedy, moved="yes") from error
 
     # ------------------------------------------------------------------ referencing
 
     def _reference_axis(self, axis: str) -> None:
-        self._refuse_at_fault([axis])
-        axis_map = self._axis_maps[axis]
-        stops = self._gcs.stops
-        self._state.begin_reference(axis)
-        self._forget_targets([axis])
+        search = ReferenceSearch(
+            next(controller for controller in self._controllers if axis in controller.axes), axis,
+            clock=self.clock, timeout_s=self._settings.reference_timeout_s,
+            stop=lambda by, reason: XYThetaStage.stop(self, by=by, reason=reason),
+        )  # fmt: skip
+        search.run()
+
+
+def _only(axes: Iterable[str], values: Mapping[str, float]) -> dict[str, float]:
+    return {axis: values[axis] for axis in axes}
+
+
+def _each(controllers: Iterable[Controller], action: Callable[[Controller], object]) -> None:
+    """Do it with every controller, also if it fails with one; then raise what went wrong, a fault first."""
+    errors: list[MicrodriversError] = []
+    for controller in controllers:
         try:
-            self._gcs.command(f"SVO {axis_map.id} 1")
-            self._gcs.command(f"RON {axis_map.id} 1")
-            self._begin_reference(axis, f"{axis_map.reference} {axis_map.id}")
-            self._await_ready(axis, stops)
-            code = self._examine()
-        finally:
-            self._state.referencing = None
-        if self._gcs.stops != stops or code == error_codes.STOPPED:
-            raise _reference_stopped(axis)
-        if not self._state.referenced[axis]:
-            raise DeviceFault(
-                f"axis {axis} has not found its reference ({axis_map.reference}); error {code}",
-                code=code or error_codes.REFERENCING_FAILED, text="referencing failed",
-                remedy="check the switches, the way, and `reference` of the axis in the rig file",
-            )  # fmt: skip
-
-    def _begin_reference(self, axis: str, line: str) -> None:
-        code = self._gcs.attempt(line)
-        if code == error_codes.MOVE_NOT_ALLOWED:
-            raise DeviceFault(
-                f"the controller does not start the reference move of axis {axis}: its servo is off",
-                code=code, text=error_codes.meaning_of(code), moved="no",
-                remedy="check the motor supply, the emergency stop and the stage cable",
-            )  # fmt: skip
-        if code:
-            raise error_codes.error_from(code, sent=line.encode())
-
-    def _await_ready(self, axis: str, stops: int) -> None:
-        """Wait until the reference move has ended, well or not."""
-        timeout_s = self._settings.reference_timeout_s
-        deadline_ns = self.clock.now_ns() + seconds_to_ns(timeout_s)
-        while not self._gcs.ready():
-            if self._gcs.stops != stops:
-                raise _reference_stopped(axis)
-            if self.clock.now_ns() >= deadline_ns:
-                XYThetaStage.stop(self, by="supervision", reason=f"axis {axis} did not find its reference")
-                raise NotReached(
-                    f"axis {axis} has not found its reference in {timeout_s:g} s; stopped",
-                    remedy="check the switches and the way, or allow more reference_timeout_s in the rig file",
-                )
-            self.clock.sleep(_REFERENCE_POLL_S)
+            action(controller)
+        except MicrodriversError as error:
+            errors.append(error)
+    if errors:
+        first, *others = sorted(errors, key=lambda error: not isinstance(error, DeviceFault))
+        first.what = "; ".join(error.what for error in (first, *others))
+        raise first
 
 
-def _servo_fault(axes: Iterable[str], code: int = 0) -> DeviceFault:
-    return DeviceFault(
-        f"the servo of axis {', '.join(axes)} has switched itself off",
-        code=code, text="servo off", remedy="check load, obstacles and cable, then clear_fault()",
-    )  # fmt: skip
+def _joined(found: Sequence[DeviceInfo]) -> DeviceInfo:
+    """What the controllers say of themselves, in the order x, y, theta where they differ."""
 
+    def join(texts: Sequence[str]) -> str:
+        return texts[0] if len(set(texts)) == 1 else "/".join(texts)
 
-def _reference_stopped(axis: str) -> MoveCancelled:
-    return MoveCancelled(
-        f"the reference move of axis {axis} was stopped",
-        remedy="check why the stop was requested, then reference the axis again",
+    return DeviceInfo(
+        driver=found[0].driver,
+        vendor=join([info.vendor for info in found]),
+        model=join([info.model for info in found]),
+        serial_number="/".join(info.serial_number for info in found),
+        firmware=join([info.firmware for info in found]),
     )

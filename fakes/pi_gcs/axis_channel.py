@@ -12,6 +12,7 @@ from microdrivers.fakes.pi_gcs.parameters import Parameter, Value
 from microdrivers.fakes.world.axis import Axis, Encoder
 
 ReferenceMove = Literal["FRF", "FNL", "FPL"]
+Memory = dict[Parameter, Value]
 
 _DEFAULT_VELOCITY_OF_MAX = 0.5
 _REFERENCE_VELOCITY_OF_MAX = 0.5
@@ -26,7 +27,7 @@ class AxisSpec:
     """What the rig file and the world say about an axis, in true units (µm or degrees).
 
     Attributes:
-        identifier: how GCS calls it.
+        identifier: how GCS calls it by default.
         key: what the rig calls it: x, y or theta.
         direction: −1 if the controller's positive sense is the rig's negative one.
         true_per_unit: true units in a controller unit: 1000 µm in a millimetre, 1 degree in a degree.
@@ -47,7 +48,13 @@ class AxisSpec:
 
 
 class AxisChannel:
-    """State of one axis. Public positions and rates are in controller units (mm, degrees), as on the wire."""
+    """State of one axis. Public positions and rates are in controller units (mm, degrees), as on the wire.
+
+    Attributes:
+        identifier: how GCS calls it at present.
+        parameters: the volatile memory.
+        stored_parameters: the non-volatile memory, which the volatile one is filled from at power-on.
+    """
 
     def __init__(self, spec: AxisSpec, axis: Axis, encoder: Encoder) -> None:
         self.spec = spec
@@ -55,19 +62,22 @@ class AxisChannel:
         self.encoder = encoder
         ends = [spec.direction * end / spec.true_per_unit for end in spec.travel]
         self.physical_travel = (min(ends), max(ends))
+        self.stored_identifier = spec.identifier
+        self.stored_parameters = self._default_parameters()
         self._power_on()
 
     def _power_on(self) -> None:
+        self.identifier = self.stored_identifier
+        self.parameters = dict(self.stored_parameters)
         self.servo = False
         self.referenced = False
         self.reference_mode = True
         self.target = 0.0
-        self.parameters = self._default_parameters()
         self._servo_on_ns = 0
         self._referencing_until_ns: int | None = None
         self._blocked = False
 
-    def _default_parameters(self) -> dict[Parameter, Value]:
+    def _default_parameters(self) -> Memory:
         spec = self.spec
         counts = Fraction(spec.true_per_unit / spec.resolution).limit_denominator(1_000_000)
         velocity, acceleration = spec.max_speed / spec.true_per_unit, spec.acceleration / spec.true_per_unit
@@ -124,15 +134,17 @@ class AxisChannel:
         close = 0.5 * self.spec.resolution
         at_ends = (true <= self.spec.travel.min + close, true >= self.spec.travel.max - close)
         negative, positive = at_ends if self.spec.direction > 0 else at_ends[::-1]
+        has_limits = not self.parameters[Parameter.HAS_NO_LIMITS]
+        beyond_reference = self.spec.direction * (true - self.spec.reference_position) >= 0.0
         bits = {
             15: self.on_target_at(t_ns),
             14: self.referencing,
             13: self.moving_at(t_ns),
             12: self.servo,
             8: error,
-            2: positive,
-            1: self.spec.direction * (true - self.spec.reference_position) >= 0.0,
-            0: negative,
+            2: positive and has_limits,
+            1: beyond_reference and self.parameters[Parameter.HAS_REFERENCE],
+            0: negative and has_limits,
         }
         return sum(1 << bit for bit, is_set in bits.items() if is_set)
 

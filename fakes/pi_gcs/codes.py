@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class ErrorCode(IntEnum):
-    """What `ERR?` reports (PI manual MS249E, list of error codes)."""
+    """What `ERR?` reports (PI manual MS249E, list of error codes); a controller never sends a negative number."""
 
     NONE = 0
     PARAMETER_SYNTAX = 1
@@ -19,7 +19,6 @@ class ErrorCode(IntEnum):
     INVALID_AXIS_IDENTIFIER = 15
     PARAMETER_OUT_OF_RANGE = 17
     AXIS_LISTED_TWICE = 22
-    ILLEGAL_AXIS = 23
     WRONG_NUMBER_OF_PARAMETERS = 24
     INVALID_NUMBER = 25
     PARAMETER_MISSING = 26
@@ -30,7 +29,9 @@ class ErrorCode(IntEnum):
     REFERENCE_MODE_OFF = 50
     MOTION_IN_PROCESS = 53
     UNKNOWN_PARAMETER = 54
+    INVALID_PASSWORD = 56
     PROTECTED_PARAMETER = 60
+    MOTION_ERROR = 1024
 
 
 class CommandError(Exception):

@@ -10,7 +10,8 @@ import numpy as np
 
 from microdrivers.core.units import seconds_to_ns
 from microdrivers.fakes.pi_gcs.codes import CommandError, ErrorCode
-from microdrivers.fakes.pi_gcs.commands import Call, run_command
+from microdrivers.fakes.pi_gcs.command_forms import Call
+from microdrivers.fakes.pi_gcs.commands import run_command
 from microdrivers.fakes.pi_gcs.state import ControllerState
 from microdrivers.fakes.wire import Reply
 
@@ -18,18 +19,20 @@ REPLY_DELAY_S = (0.001, 0.003)
 """Shortest and longest time from a request's last byte to the reply's first."""
 MAX_LINE_BYTES = 256
 """Longest command line without its line feed."""
-ADDRESS = 1
-"""The controller's place on the line; it also answers what has no address."""
+FIRST_ADDRESS = 1
+"""The controller with this address is meant, and answers without a prefix, where a line has no address."""
+BROADCAST_ADDRESS = 255
+"""All controllers on a line are meant, and none of them answers."""
 
 _LINE_FEED = 0x0A
 _NUMBER = re.compile(rb"\d{1,3}")
 
 
 class _Header(NamedTuple):
-    """Where a line goes to, and what the reply's first line begins with."""
+    """Where a line goes to, and what the reply's first line begins with; without a prefix there is no reply."""
 
     address: int
-    prefix: str
+    prefix: str | None
 
 
 class GcsController:
@@ -38,10 +41,14 @@ class GcsController:
     A command is carried out at the instant at which its last byte arrives. Its reply leaves after a seeded
     delay within REPLY_DELAY_S, in the order of the requests. A new VEL, ACC or DEC holds from the next motion
     on.
+
+    Args:
+        address: its place on the line, 1 to 16; it ignores what is meant for others.
     """
 
-    def __init__(self, state: ControllerState, *, seed: int) -> None:
+    def __init__(self, state: ControllerState, *, seed: int, address: int = FIRST_ADDRESS) -> None:
         self.state = state
+        self.address = address
         self._random = np.random.default_rng(seed)
         self._line = bytearray()
         self._too_long = False
@@ -80,6 +87,11 @@ class GcsController:
         self._line.clear()
         self._too_long = False
 
+    def motion_error(self, key: str, t_ns: int) -> None:
+        """Something holds the axis x, y or theta: the position error grows too large, the servo drops out."""
+        self.state.update(t_ns)
+        self.state.motion_error(key, t_ns)
+
     # ------------------------------------------------------------------ bytes
 
     def _take(self, byte: int, t_ns: int) -> Reply | None:
@@ -97,20 +109,25 @@ class GcsController:
         return None
 
     def _run_single_byte(self, byte: int, t_ns: int) -> Reply | None:
-        words = bytes(self._line).split()
-        header = _Header(ADDRESS, "")
-        if self._line[-1:].isspace():
-            begun = _take_header(words)
-            header = header if words else begun
-        if header.address != ADDRESS:
+        header = self._take_begun_header()
+        if not self._is_meant(header):
             return None
         self.state.update(t_ns)
         return self._reply(_SINGLE_BYTES[byte](self.state, t_ns), header.prefix, t_ns)
 
+    def _take_begun_header(self) -> _Header:
+        """An address in front of a single byte is its own, unless a command has begun behind it."""
+        words = bytes(self._line).split()
+        header = _take_header(words)
+        if words or not self._line[-1:].isspace():
+            return _Header(FIRST_ADDRESS, "")
+        self._line.clear()
+        return header
+
     def _run_line(self, line: bytes, too_long: bool, t_ns: int) -> Reply | None:
         words = line.split()
         header = _take_header(words)
-        if header.address != ADDRESS or not words:
+        if not self._is_meant(header) or not words:
             return None
         self.state.update(t_ns)
         name, *arguments = (word.decode("latin-1") for word in words)
@@ -123,8 +140,11 @@ class GcsController:
             return None
         return self._reply(lines, header.prefix, t_ns)
 
-    def _reply(self, lines: Sequence[str], prefix: str, t_ns: int) -> Reply | None:
-        if not lines:
+    def _is_meant(self, header: _Header) -> bool:
+        return header.address in (self.address, BROADCAST_ADDRESS)
+
+    def _reply(self, lines: Sequence[str], prefix: str | None, t_ns: int) -> Reply | None:
+        if not lines or prefix is None:
             return None
         delay_ns = max(seconds_to_ns(self._random.uniform(*REPLY_DELAY_S)), self.state.pose_latch_delay_ns)
         self._last_reply_ns = max(t_ns + delay_ns, self._last_reply_ns)
@@ -138,7 +158,9 @@ def _take_header(words: list[bytes]) -> _Header:
     while words and len(numbers) < 2 and _NUMBER.fullmatch(words[0]):
         numbers.append(int(words.pop(0)))
     if not numbers:
-        return _Header(ADDRESS, "")
+        return _Header(FIRST_ADDRESS, "")
+    if numbers[0] == BROADCAST_ADDRESS:
+        return _Header(BROADCAST_ADDRESS, None)
     sender = numbers[1] if len(numbers) > 1 else 0
     return _Header(numbers[0], f"{sender} {numbers[0]} ")
 

@@ -1,29 +1,23 @@
-"""Puts the controller at the other end of the driver's serial line."""
+"""Puts the controller, or a chain of controllers, at the other end of the driver's serial line."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-import pydantic
-from pydantic import AliasChoices
 
 from microdrivers.core.errors import UnsupportedError
-from microdrivers.core.units import UM_PER_MM, Range
 from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
-from microdrivers.fakes.pi_gcs.axis_channel import AxisChannel, AxisSpec
-from microdrivers.fakes.pi_gcs.controller import GcsController
+from microdrivers.fakes.pi_gcs.axis_channel import AxisChannel
+from microdrivers.fakes.pi_gcs.controller import FIRST_ADDRESS, GcsController
+from microdrivers.fakes.pi_gcs.daisy_chain import DaisyChain
+from microdrivers.fakes.pi_gcs.settings import AxisSettings, StageSettings
 from microdrivers.fakes.pi_gcs.state import ControllerState
 from microdrivers.fakes.wire import Wire, forget_wire, register_wire, serve_wire
 from microdrivers.fakes.world.axis import Axis, Encoder
 
 _BITS_PER_BYTE = 10
-_DEFAULT_SERIAL_NUMBER = "116012345"
-_FIRMWARE = "1.2.0.5"
-_TRUE_PER_UNIT = {"x": UM_PER_MM, "y": UM_PER_MM, "theta": 1.0}
-_DEFAULT_STAGE = {"x": "M-111.1DG", "y": "M-111.1DG", "theta": "M-116.DG"}
 
 
 @runtime_checkable
@@ -42,90 +36,51 @@ class StageWorld(Protocol):
     pose_latch_delay_s: float
 
 
-class _Settings(pydantic.BaseModel):
-    """The part of the rig file that a controller could know; the rest is the driver's."""
-
-    model_config = pydantic.ConfigDict(extra="ignore", frozen=True)
-
-
-class _Axis(_Settings):
-    """Numbers in µm for x and y, in degrees for theta."""
-
-    id: str
-    stage: str | None = None
-    direction: Literal[1, -1] = 1
-    travel: Range = pydantic.Field(validation_alias=AliasChoices("travel_um", "travel_deg"))
-    max_speed: float = pydantic.Field(validation_alias=AliasChoices("max_speed_um_s", "max_speed_deg_s"))
-    acceleration: float = pydantic.Field(validation_alias=AliasChoices("acceleration_um_s2", "acceleration_deg_s2"))
-    resolution: float = pydantic.Field(validation_alias=AliasChoices("resolution_um", "resolution_deg"))
-    tolerance: float = pydantic.Field(validation_alias=AliasChoices("tolerance_um", "tolerance_deg"))
-
-    def spec(self, key: str, reference_position: float) -> AxisSpec:
-        return AxisSpec(
-            identifier=self.id,
-            key=key,
-            stage=self.stage or _DEFAULT_STAGE[key],
-            direction=self.direction,
-            true_per_unit=_TRUE_PER_UNIT[key],
-            travel=self.travel,
-            max_speed=self.max_speed,
-            acceleration=self.acceleration,
-            resolution=self.resolution,
-            tolerance=self.tolerance,
-            reference_position=reference_position,
-        )
-
-
-class _Axes(_Settings):
-    x: _Axis
-    y: _Axis
-    theta: _Axis
-
-    def by_key(self) -> Mapping[str, _Axis]:
-        return {"x": self.x, "y": self.y, "theta": self.theta}
-
-
-class _Connection(_Settings):
-    baudrate: int = 115200
-
-
-class StageSettings(_Settings):
-    """The section of the rig file."""
-
-    connection: _Connection
-    controller: str = "C-884"
-    serial_number: str | None = None
-    axes: _Axes
-
-    def identification(self) -> str:
-        """The reply to *IDN?."""
-        model = self.controller if "." in self.controller else f"{self.controller}.4DC"
-        serial_number = self.serial_number or _DEFAULT_SERIAL_NUMBER
-        return f"(c)2016 Physik Instrumente (PI) GmbH & Co. KG, {model}, {serial_number}, {_FIRMWARE}"
-
-
-def build_controller(stage: StageSettings, world: StageWorld, *, seed: int) -> GcsController:
-    """The controller of a rig file's stage section, on a world's axes."""
+def build_emulator(stage: StageSettings, world: StageWorld, *, seed: int) -> GcsController | DaisyChain:
+    """What a rig file's stage section describes, on a world's axes: a controller, or a chain of controllers."""
     random = np.random.default_rng(seed)
-    channels = []
-    for key, axis in stage.axes.by_key().items():
-        spec = axis.spec(key, world.reference_position[key])
-        encoder = Encoder(
-            world.stage_axes[key],
-            resolution=spec.resolution,
-            noise=world.encoder_noise[key],
-            seed=int(random.integers(2**31)),
-            offset=world.power_on_offset[key],
-        )
-        channels.append(AxisChannel(spec, world.stage_axes[key], encoder))
+    return _build_chain(stage, world, random) if stage.chained else _build_controller(stage, world, random)
+
+
+def _build_controller(stage: StageSettings, world: StageWorld, random: np.random.Generator) -> GcsController:
+    channels = [_build_channel(key, axis, world, random) for key, axis in stage.by_key().items()]
     state = ControllerState(
         channels, identification=stage.identification(), pose_latch_delay_s=world.pose_latch_delay_s
     )
-    return GcsController(state, seed=int(random.integers(2**31)))
+    return GcsController(state, seed=_draw_seed(random))
+
+
+def _build_chain(stage: StageSettings, world: StageWorld, random: np.random.Generator) -> DaisyChain:
+    boxes = {}
+    for key, axis in stage.by_key().items():
+        state = ControllerState(
+            [_build_channel(key, axis, world, random)],
+            identification=stage.identification_of(axis),
+            pose_latch_delay_s=world.pose_latch_delay_s,
+            one_element_per_line=True,
+        )
+        boxes[key] = GcsController(state, seed=_draw_seed(random), address=axis.address or FIRST_ADDRESS)
+    return DaisyChain(boxes)
+
+
+def _build_channel(key: str, axis: AxisSettings, world: StageWorld, random: np.random.Generator) -> AxisChannel:
+    spec = axis.spec(key, world.reference_position[key])
+    encoder = Encoder(
+        world.stage_axes[key],
+        resolution=spec.resolution,
+        noise=world.encoder_noise[key],
+        seed=_draw_seed(random),
+        offset=world.power_on_offset[key],
+    )
+    return AxisChannel(spec, world.stage_axes[key], encoder)
+
+
+def _draw_seed(random: np.random.Generator) -> int:
+    return int(random.integers(2**31))
 
 
 def attach(request: EmulationRequest) -> Emulation:
-    """Put a controller behind `fake://NAME`.
+    """Put a controller, or a chain of them, behind `fake://NAME`.
 
     Raises:
         UnsupportedError: the world has no XYθ stage.
@@ -137,9 +92,8 @@ def attach(request: EmulationRequest) -> Emulation:
             remedy="choose a world with a stage, for example world: microscope",
         )
     stage = StageSettings.model_validate(request.settings)
-    controller = build_controller(stage, request.world, seed=request.seed)
     wire = Wire(
-        controller,
+        build_emulator(stage, request.world, seed=request.seed),
         clock=request.clock,
         seed=request.seed + 1,
         baudrate=stage.connection.baudrate,

@@ -15,6 +15,7 @@ Value = float | int | str
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
 _IDENTIFIER = re.compile(r"0[xX][0-9a-fA-F]+|\d+", re.ASCII)
+_STAGE_NAME = re.compile(r"[\x21-\x7e]{1,20}")
 _LARGEST_INTEGER = 2**31 - 1
 _LONGEST_SETTLING_S = 100.0
 _RATE_TOLERANCE = 1e-6
@@ -71,7 +72,7 @@ DESCRIPTIONS = {
     Parameter.MIN_TRAVEL: Description(float, "Stage", "Maximum travel in negative direction"),
     Parameter.HAS_NO_LIMITS: Description(int, "Stage", "Has NO limit switches"),
     Parameter.SETTLING_WINDOW: Description(int, "Servo", "Settling window"),
-    Parameter.STAGE_NAME: Description(str, "Stage", "Stage name", protected=True),
+    Parameter.STAGE_NAME: Description(str, "Stage", "Stage name"),
     Parameter.SETTLING_TIME: Description(float, "Servo", "Settling time"),
     Parameter.VELOCITY: Description(float, "Motion", "Closed-loop velocity"),
     Parameter.MAX_ACCELERATION: Description(float, "Motion", "Maximum acceleration", protected=True),
@@ -166,6 +167,10 @@ def check_parameter(
         raise CommandError(ErrorCode.PROTECTED_PARAMETER)
     if parameter in _SWITCHES:
         return int(read_switch(text))
+    if description.kind is str:
+        if not _STAGE_NAME.fullmatch(text):
+            raise CommandError(ErrorCode.PARAMETER_OUT_OF_RANGE)
+        return text
     value = read_integer(text) if description.kind is int else read_decimal(text)
     if parameter in _TRAVEL:
         limits = {name: values[name] for name in _TRAVEL} | {parameter: value}

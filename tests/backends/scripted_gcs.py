@@ -28,6 +28,8 @@ Answer = bytes | None | Callable[[], bytes | None]
 class ScriptedPeer:
     """Answers each request with `script[request]`, after `delay_s[request]`; silent where there is nothing."""
 
+    request_form = _REQUEST
+
     def __init__(self, script: Mapping[bytes, Answer] | None = None) -> None:
         self.script: dict[bytes, Answer] = dict(script or {})
         self.delay_s: dict[bytes, float] = {}
@@ -37,7 +39,7 @@ class ScriptedPeer:
     def receive(self, data: bytes, start_ns: int, end_ns: int) -> Sequence[Reply]:
         self._buffer += data
         replies = []
-        while match := _REQUEST.match(self._buffer):
+        while match := self.request_form.match(self._buffer):
             request = match.group()
             self._buffer = self._buffer[match.end() :]
             self.requests.append(request)

@@ -232,8 +232,9 @@ def test_a_query_without_reply_is_repeated_once() -> None:
 
 def test_a_refused_query_names_the_reason() -> None:
     gcs, peer = controller({b"ERR?\n": b"2\n"})
-    with pytest.raises(ProtocolError, match="unknown command"):
+    with pytest.raises(ProtocolError, match="unknown command") as caught:
         gcs.numbers("ACC?")
+    assert (caught.value.sent, caught.value.received) == (b"ACC?\n", b"2\n")
     assert peer.requests.count(b"ACC?\n") == 1
 
 

@@ -21,6 +21,9 @@ from microdrivers.fakes.wire import Reply, Wire, wire_named
 from microdrivers.rig import Rig, build_rig, load_rig_file
 from microdrivers.rig.serving import ServedRig
 
+CHAINED = Path(__file__).parents[1] / "data" / "chained_workstation.yaml"
+"""The workstation with three single-axis controllers on one line in place of one for three axes."""
+
 Given = TypeVar("Given")
 
 
@@ -40,7 +43,7 @@ class StageBench(Bench):
     """A stage, and what is true of it.
 
     `truth(axis, t_ns)` is where the table is, µm or degrees, by another way than the driver: the emulator's own axis, a
-    gauge. `noise_um` bounds encoder noise and quantisation. `power_cycle()` switches the controller off and on. While
+    gauge. `noise_um` bounds encoder noise and quantisation. `pose_rate_hz` is what the device's line can carry. `power_cycle()` switches the controller off and on. While
     the context `silence()` is open the device hears and does not answer.
     """
 
@@ -48,6 +51,7 @@ class StageBench(Bench):
     clock: Clock
     truth: Callable[[str, int], float]
     noise_um: float = 0.1
+    pose_rate_hz: float = 100.0
     home: Mapping[str, float] = field(default_factory=lambda: {"x": 7500.0, "y": 7500.0, "theta": 0.0})
     power_cycle: Callable[[], None] | None = None
     silence: Callable[[], AbstractContextManager[None]] | None = None
@@ -110,11 +114,12 @@ def _wire_of(name: str) -> Any:
     return wire
 
 
-def _stage_bench(stage: XYThetaStage, clock: Clock, world: Any) -> StageBench:
+def _stage_bench(stage: XYThetaStage, clock: Clock, world: Any, file: Path | None) -> StageBench:
     wire = _wire_of(stage.name)
     return StageBench(
         stage,
         clock,
+        pose_rate_hz=40.0 if file == CHAINED else 100.0,  # a chain's controllers answer one after the other
         truth=lambda axis, t_ns: world.stage_axes[axis].position_at(t_ns),
         power_cycle=lambda: wire.emulator.power_cycle(clock.now_ns()),
         silence=lambda: _silence(wire),
@@ -148,7 +153,7 @@ def stage_bench(
         stage = rig.device("sample_stage", XYThetaStage)
         if referenced:
             stage.reference(["x", "y", "theta"])
-        yield _stage_bench(stage, rig.clock, rig.simulation.world)
+        yield _stage_bench(stage, rig.clock, rig.simulation.world, file)
 
 
 @contextmanager
@@ -199,7 +204,7 @@ def served_stage_bench(
     with served(transport, "sample_stage", file=file, drivers=drivers) as (rig, serving):
         stage = rig.device("sample_stage", XYThetaStage)
         stage.reference(["x", "y", "theta"])
-        yield _stage_bench(stage, rig.clock, serving.simulation.world)
+        yield _stage_bench(stage, rig.clock, serving.simulation.world, file)
 
 
 @contextmanager

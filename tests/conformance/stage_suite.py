@@ -59,11 +59,11 @@ def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
     samples: list[XYThetaSample] = []
     bench.stage.topic.subscribe(samples.append)
     move = bench.stage.start_move_to(**_near(bench, x_um=700.0), speed_um_s=1000.0)
-    with bench.stage.stream(100.0):
+    with bench.stage.stream(bench.pose_rate_hz):
         bench.clock.sleep(0.5)
     move.wait()
     moving = [sample for sample in samples if sample.moving]
-    assert len(moving) > 30
+    assert len(moving) >= 0.6 * 0.5 * bench.pose_rate_hz
     within = [
         abs(sample.x_um - bench.truth("x", sample.t_ns)) <= bench.noise_um + 1000.0 * 1.5e-9 * sample.dt_ns
         for sample in moving

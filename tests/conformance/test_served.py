@@ -3,15 +3,28 @@
 import threading
 
 import pytest
+import yaml
 
 from microdrivers.backends.oriental_az.zoom import AzZoomMotor
 from microdrivers.backends.pi_gcs.stage import GcsXYThetaStage
+from microdrivers.configs import shipped_rig
 from microdrivers.core.errors import LinkLost
 from tests.conformance import live_suite, stage_suite, zoom_suite
-from tests.conformance.bench import served, served_stage_bench, served_zoom_bench, stage_bench, zoom_bench
+from tests.conformance.bench import CHAINED, served, served_stage_bench, served_zoom_bench, stage_bench, zoom_bench
 
 # One after the other: they run in real time.
 pytestmark = pytest.mark.xdist_group("real_time")
+
+
+@pytest.fixture
+def modbus_tcp_rig(tmp_path):
+    """The workstation with its zoom motor behind a Modbus TCP gateway."""
+    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    data["devices"]["zoom"]["connection"] = {"port": "socket://127.0.0.1:502", "framing": "tcp", "timeout_s": 0.5}
+    file = tmp_path / "gateway.yaml"
+    file.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return file
+
 
 STAGE, ZOOM, LIVE = stage_suite.SUITE.checks, zoom_suite.SUITE.checks, live_suite.SUITE.checks
 
@@ -66,9 +79,22 @@ def test_a_second_host_is_turned_away():
             second.open()
 
 
+@pytest.mark.parametrize("name", STAGE)
+def test_a_chain_of_three_controllers_on_a_pseudo_terminal(name):
+    with served_stage_bench("pty", file=CHAINED) as bench:
+        STAGE[name](bench)
+
+
+@pytest.mark.parametrize("name", ZOOM)
+def test_az_zoom_over_modbus_tcp(name, modbus_tcp_rig):
+    with served_zoom_bench("tcp", file=modbus_tcp_rig) as bench:
+        ZOOM[name](bench)
+
+
+@pytest.mark.parametrize("file", [None, CHAINED], ids=["one controller", "chain"])
 @pytest.mark.parametrize("name", LIVE)
-def test_gcs_stage_with_threads(name):
-    with served_stage_bench("pty") as bench:
+def test_gcs_stage_with_threads(name, file):
+    with served_stage_bench("pty", file=file) as bench:
         LIVE[name](bench)
 
 

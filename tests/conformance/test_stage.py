@@ -7,13 +7,19 @@ import pytest
 
 from microdrivers.backends.pi_gcs.stage import GcsXYThetaStage
 from microdrivers.core.errors import MicrodriversError
-from tests.conformance.bench import stage_bench
+from tests.conformance.bench import CHAINED, stage_bench
 from tests.conformance.stage_suite import SUITE
 
 
 @pytest.mark.parametrize("name", SUITE.checks)
 def test_gcs_stage_in_process(name):
     with stage_bench() as bench:
+        SUITE.checks[name](bench)
+
+
+@pytest.mark.parametrize("name", SUITE.checks)
+def test_a_chain_of_three_controllers_in_process(name):
+    with stage_bench(file=CHAINED) as bench:
         SUITE.checks[name](bench)
 
 

@@ -134,6 +134,7 @@ def test_help_lists_what_clients_rely_on(bench: GcsBench) -> None:
     names = {row.split()[0] for row in rows}
     asked_for = "*IDN? CSV? HLP? VER? SAI? CST? SVO SVO? RON RON? FRF FNL FPL FRF? POS POS? MOV MOV? MVR ONT? TMN?"
     asked_for += " TMX? VEL VEL? ACC ACC? DEC DEC? HLT STP ERR? SPA SPA? HPA? TRS? LIM? RBT #4 #5 #7 #8 #24"
+    asked_for += " SAI SRG? SEP SEP? WPA RPA CTO CTO? DIO DIO? TIO? TRO TRO?"
     assert names == set(asked_for.split())
 
 
@@ -231,9 +232,29 @@ def test_status_register(ready: GcsBench) -> None:
     assert ready.ask(b"\x04") == b"0x700190060002\n"
 
 
+def test_the_status_register_by_its_name(ready: GcsBench) -> None:
+    assert ready.line("SRG? 1 1") == "1 1=0x9002"
+    ready.line("MOV 2 0")
+    ready.line("SVO 3 0")
+    ready.line("FOO")
+    assert ready.line("SRG?") == "1 1=0x9102 \n2 1=0x3100 \n3 1=0x0102"
+    assert ready.error_after("SRG? 1 2") == 17
+    assert ready.error_after("SRG? 1") == 26
+    assert ready.error_after("SRG? 4 1") == 15
+
+
+def test_switches_that_a_stage_lacks_show_nothing(ready: GcsBench) -> None:
+    ready.line("MOV 1 15 2 0")
+    ready.wait(10.0)
+    assert ready.ask(b"\x04") == b"0x900690019002\n"
+    ready.line("SPA 1 0x32 1 1 0x14 0 2 0x32 1 3 0x14 0")
+    assert ready.ask(b"\x04") == b"0x900090009000\n"
+
+
 # ---------------------------------------------------------------------- any bytes at all
 
 VOCABULARY = """SVO MOV MVR VEL ACC DEC FRF FNL FPL POS POS? RON HLT STP ERR? SPA SPA? ONT? HLP? HPA? RBT
+SRG? SEP WPA RPA CTO CTO? DIO DIO? TRO 100
 1 2 3 4 0 -1 1e300 7.25 1e-7 0.3 0.002 14.9 0x36 0x3F 0x15 0x50"""
 WORDS = st.sampled_from(VOCABULARY.split())
 SINGLES = st.sampled_from([b"\x04", b"\x05", b"\x07", b"\x08", b"\x18"])

@@ -218,6 +218,42 @@ def test_servo_off_ends_the_motion(ready: GcsBench) -> None:
     assert ready.error_after("MOV 1 1") == 5
 
 
+def test_a_motion_error_switches_the_servo_off(ready: GcsBench) -> None:
+    ready.line("MOV 1 0 2 0")
+    ready.wait(1.0)
+    before_um = ready.true_position("x")
+    ready.controller.motion_error("x", ready.t_ns)
+    assert ready.line("SVO?") == "1=0 \n2=1 \n3=1"
+    ready.wait(0.01)
+    assert ready.ask(b"\x04")[:6] == b"0x0100"
+    assert ready.error() == 1024
+    assert ready.error() == 0
+    ready.wait(0.1)
+    assert ready.true_position("x") == pytest.approx(before_um, abs=10.0)
+    assert ready.ask(b"\x05") == b"2\n"
+    assert "motion error x" in events(ready)
+    assert ready.line("FRF? 1") == "1=1"
+    assert ready.error_after("MOV 1 1") == 5
+    assert ready.error_after("SVO 1 1") == 0
+    assert ready.error_after("MOV 1 1") == 0
+
+
+def test_an_axis_whose_servo_is_off_cannot_fail_to_follow(ready: GcsBench) -> None:
+    ready.line("SVO 1 0")
+    ready.controller.motion_error("x", ready.t_ns)
+    assert ready.error() == 0
+
+
+def test_a_motion_error_while_referencing_leaves_the_axis_unreferenced() -> None:
+    bench = GcsBench()
+    bench.line("SVO 1 1")
+    bench.line("FRF 1")
+    bench.wait(0.5)
+    bench.controller.motion_error("x", bench.t_ns)
+    assert bench.ask(b"\x07") == READY
+    assert bench.line("FRF? 1") == "1=0"
+
+
 # ---------------------------------------------------------------------- referencing
 
 
