@@ -1,4 +1,4 @@
-"""A zoom motor on an Oriental Motor AZ stepper drive, over Modbus RTU."""
+"""A zoom motor on an Oriental Motor AZ stepper drive, over Modbus RTU or TCP."""
 
 from __future__ import annotations
 

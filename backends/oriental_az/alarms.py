@@ -7,6 +7,7 @@ from typing import NamedTuple
 from microdrivers.core.errors import DeviceFault, Moved
 
 HOMING_INCOMPLETE = 0x4A
+COMMUNICATION_TIMEOUT = 0x85
 
 
 class Alarm(NamedTuple):
@@ -49,18 +50,31 @@ ALARMS: dict[int, Alarm] = {
     0x67: Alarm("a software limit was reached", "compare curve and zoom_range with the drive's limits"),
     0x70: Alarm("operation data error", "check speed, acceleration, current and curve in the rig file"),
     0x81: Alarm("network bus error", "check the network module and its supply"),
-    0x84: Alarm("too many bad frames on RS-485", "check wiring, termination, baud rate and parity"),
-    0x85: Alarm("RS-485 time-out", "stream the device, or switch the drive's communication time-out off"),
+    0x84: Alarm(
+        "too many bad frames on RS-485, one after the other",
+        "check wiring, termination, baud rate and parity, and that no other master speaks on the line",
+    ),
+    COMMUNICATION_TIMEOUT: Alarm(
+        "the drive heard nothing from the host for longer than its communication time-out",
+        "find out whether the host was stopped or suspended, or the cable pulled; if it was only slow, lengthen "
+        "communication_timeout_s in the rig file",
+    ),
     0xF0: Alarm("processor error", "have the drive repaired if it comes back", resettable=False),
     0xF3: Alarm("processor overload", "switch off extended functions of the drive", resettable=False),
 }  # fmt: skip
 
 
-def alarm_fault(code: int, *, moved: Moved, during: str = "") -> DeviceFault:
-    """The error for an alarm that is on; `during` begins the sentence."""
+def alarm_fault(code: int, *, moved: Moved, during: str = "", communication_timeout_s: float = 0.0) -> DeviceFault:
+    """The error for an alarm that is on; `during` begins the sentence.
+
+    `communication_timeout_s` is the drive's, if it has one.
+    """
     alarm = ALARMS.get(code, Alarm("unknown to this driver", "look it up in the drive's manual"))
     then = "clear_fault()" if alarm.resettable else "switch the drive off and on, and open the rig again"
+    text = alarm.text
+    if code == COMMUNICATION_TIMEOUT and communication_timeout_s:
+        text += f" ({communication_timeout_s:g} s)"
     return DeviceFault(
-        f"{during}alarm {code:02X}h is on: {alarm.text}",
-        code=code, text=alarm.text, remedy=f"{alarm.remedy}; then {then}", moved=moved,
+        f"{during}alarm {code:02X}h is on: {text}",
+        code=code, text=text, remedy=f"{alarm.remedy}; then {then}", moved=moved,
     )  # fmt: skip

@@ -1,22 +1,24 @@
 """The AZ drive's registers, and what can be asked of it.
 
-Addresses, units and bits as the drive leaves the factory (Oriental Motor HP-5142E; AZ: bits of 007Dh and 007Fh). A
-32-bit value has its upper word at the even address, negative values in two's complement; both words go in one query.
+Addresses, units and bits as the drive leaves the factory (Oriental Motor HP-5142E; AZ: bits of 007Dh and 007Fh). All
+values have 32 bits, an even address and the odd one behind it; both words go in one query.
 """
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from typing import NamedTuple
 
+from microdrivers.backends.modbus.master import ModbusMaster, ModbusRefusal
+from microdrivers.backends.modbus.register_order import RegisterOrder
 from microdrivers.backends.oriental_az.alarms import alarm_fault
-from microdrivers.backends.oriental_az.rtu import RtuMaster, RtuRefusal
-from microdrivers.core.errors import MicrodriversError, RefusedError
+from microdrivers.core.errors import DeviceFault, MicrodriversError, Moved, RefusedError
 
 DIRECT_DATA = 0x0058
 """Direct data operation: data no., type, position, speed, start rate, stop rate, current, trigger; 32 bits each."""
-DRIVER_INPUT = 0x007D
-"""Input word; `Input`. Levels: a bit stays on until it is written off."""
+DRIVER_INPUT = 0x007C
+"""Input words, upper (unused here) and lower; `Input`. Levels: a bit stays on until it is written off."""
 DRIVER_OUTPUT = 0x007E
 """Output words, upper (unassigned) and lower; `Output`."""
 PRESENT_ALARM = 0x0080
@@ -24,6 +26,8 @@ COMMUNICATION_ERROR = 0x00AC
 MOTION = 0x00C6
 """Command position (step), command speed (r/min), command speed (step/s), feedback position (step); 32 bits each."""
 _MOTION_REGISTERS = 8
+
+FACTORY_ORDER = RegisterOrder("high-first", "big")
 
 _DATA_NUMBER = 0
 _ABSOLUTE = 1
@@ -85,46 +89,54 @@ class Motion(NamedTuple):
     dt_ns: int
 
 
-def to_words(value: int) -> tuple[int, int]:
-    """A signed or unsigned 32-bit value as upper and lower word."""
-    return value >> 16 & 0xFFFF, value & 0xFFFF
-
-
-def from_words(upper: int, lower: int) -> int:
-    """The signed 32-bit value of an upper and a lower word."""
-    value = upper << 16 | lower
-    return value - (1 << 32) if value & 1 << 31 else value
-
-
 class AzDrive:
-    """One AZ drive on a Modbus line."""
+    """One AZ drive on a Modbus line.
 
-    def __init__(self, rtu: RtuMaster) -> None:
-        self._rtu = rtu
+    Attributes:
+        communication_timeout_s: the drive's, as far as it is known; 0 if it does not watch the host.
+    """
+
+    def __init__(self, modbus: ModbusMaster, order: RegisterOrder = FACTORY_ORDER) -> None:
+        self.communication_timeout_s = 0.0
+        self._modbus = modbus
+        self._order = order
 
     def read_status(self) -> Status:
         """The output word."""
-        reply = self._rtu.read(DRIVER_OUTPUT, 2)
-        return Status(Output(reply.values[1]), reply.t_ns)
+        reply = self._modbus.read(DRIVER_OUTPUT, 2)
+        return Status(Output(self._order.from_registers(*reply.values) & 0xFFFF), reply.t_ns)
 
     def read_motion(self) -> Motion:
         """Command and feedback in one exchange."""
-        values, t_ns, dt_ns = self._rtu.read(MOTION, _MOTION_REGISTERS)
+        values, t_ns, dt_ns = self._modbus.read(MOTION, _MOTION_REGISTERS)
+        decoded = self._order.from_registers
         return Motion(
-            command_position=from_words(values[0], values[1]),
-            command_speed_hz=from_words(values[4], values[5]),
-            feedback_position=from_words(values[6], values[7]),
+            command_position=decoded(values[0], values[1]),
+            command_speed_hz=decoded(values[4], values[5]),
+            feedback_position=decoded(values[6], values[7]),
             t_ns=t_ns,
             dt_ns=dt_ns,
         )
 
     def read_alarm(self) -> int:
         """Code of the present alarm, 0 if there is none."""
-        return self._read_code(PRESENT_ALARM)
+        return self.read_value(PRESENT_ALARM)
 
     def read_communication_error(self) -> int:
         """Code of the latest communication error, 0 if there was none since power-on."""
-        return self._read_code(COMMUNICATION_ERROR)
+        return self.read_value(COMMUNICATION_ERROR)
+
+    def read_value(self, address: int) -> int:
+        """One value."""
+        return self._order.from_registers(*self._modbus.read(address, 2).values)
+
+    def write_value(self, address: int, value: int) -> None:
+        """Write one value.
+
+        Raises:
+            DeviceFault, RefusedError, LinkError: as for `start_absolute`.
+        """
+        self._write(address, self._order.to_registers(value))
 
     def start_absolute(self, position_steps: int, *, speed_hz: int, rate_hz_s: int, current_permille: int) -> None:
         """Start an absolute positioning operation (direct data operation, all data at once).
@@ -141,11 +153,7 @@ class AzDrive:
         """
         rates = (rate_hz_s, rate_hz_s)
         items = (_DATA_NUMBER, _ABSOLUTE, position_steps, speed_hz, *rates, current_permille, _TRIGGER_ALL_DATA)
-        words = [word for item in items for word in to_words(item)]
-        try:
-            self._rtu.write_block(DIRECT_DATA, words)
-        except RtuRefusal as refusal:
-            raise self._explain(refusal) from refusal
+        self._write(DIRECT_DATA, [register for item in items for register in self._order.to_registers(item)])
 
     def write_input(self, word: Input) -> None:
         """Write the input word.
@@ -153,10 +161,7 @@ class AzDrive:
         Raises:
             DeviceFault, RefusedError, LinkError: as for `start_absolute`.
         """
-        try:
-            self._rtu.write(DRIVER_INPUT, word)
-        except RtuRefusal as refusal:
-            raise self._explain(refusal) from refusal
+        self._write(*self._input_registers(word))
 
     def pulse_input(self, word: Input) -> None:
         """Turn inputs on and off again: an edge."""
@@ -165,18 +170,34 @@ class AzDrive:
 
     def post_stop(self) -> None:
         """Turn STOP on, from any thread, as soon as the line is free. It stays on until the word is written again."""
-        self._rtu.post(DRIVER_INPUT, Input.STOP)
+        self._modbus.post(*self._input_registers(Input.STOP))
 
-    def _read_code(self, address: int) -> int:
-        return from_words(*self._rtu.read(address, 2).values)
+    def fault(self, alarm_code: int, *, moved: Moved, during: str = "") -> DeviceFault:
+        """The error for an alarm of this drive that is on; `during` begins the sentence."""
+        return alarm_fault(alarm_code, moved=moved, during=during, communication_timeout_s=self.communication_timeout_s)
 
-    def _explain(self, refusal: RtuRefusal) -> MicrodriversError:
+    def _input_registers(self, word: Input) -> tuple[int, Sequence[int]]:
+        """Address and registers of the input word; in an order that is not the factory's, never one of them alone."""
+        if self._order == FACTORY_ORDER:
+            return DRIVER_INPUT + 1, (word,)
+        return DRIVER_INPUT, self._order.to_registers(word)
+
+    def _write(self, address: int, registers: Sequence[int]) -> None:
+        try:
+            if len(registers) == 1:
+                self._modbus.write(address, registers[0])
+            else:
+                self._modbus.write_block(address, registers)
+        except ModbusRefusal as refusal:
+            raise self._explain(refusal) from refusal
+
+    def _explain(self, refusal: ModbusRefusal) -> MicrodriversError:
         """Exception 04 has many causes: ask the drive which."""
         if refusal.exception_code != _SLAVE_ERROR:
             return refusal
         alarm = self.read_alarm()
         if alarm:
-            return alarm_fault(alarm, moved="no", during="the drive refused the command: ")
+            return self.fault(alarm, moved="no", during="the drive refused the command: ")
         code = self.read_communication_error()
         cause = _COMMUNICATION_ERRORS.get(code, "an unknown reason")
         return RefusedError(

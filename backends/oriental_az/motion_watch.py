@@ -24,6 +24,9 @@ START_UP_S = 1.0
 class MotionWatch:
     """The state of the motor as far as it is known. Feed it with all that is read, in order of time.
 
+    `may_have_restarted` tells whether the drive was silent before the latest status for as long as switching it off
+    and on takes.
+
     Args:
         tolerance_steps: how far the feedback of a motor at rest may wander.
         settle_s: how long it must stand still to count as at rest where the drive does not report arrival, which it
@@ -33,6 +36,7 @@ class MotionWatch:
     def __init__(self, *, tolerance_steps: int, settle_s: float) -> None:
         self.moving = True
         self.referenced = False
+        self.may_have_restarted = False
         self.outputs = Output.NONE
         self._tolerance_steps = max(1, tolerance_steps)
         self._settle_ns = seconds_to_ns(settle_s)
@@ -82,8 +86,9 @@ class MotionWatch:
 
     def see_status(self, status: Status) -> None:
         """Take in the output word."""
-        if self._link_failed and status.t_ns - self._heard_ns >= seconds_to_ns(START_UP_S):
-            self._operated = False  # it may have been switched off and on: its own word counts
+        self.may_have_restarted = self._link_failed and status.t_ns - self._heard_ns >= seconds_to_ns(START_UP_S)
+        if self.may_have_restarted:
+            self._operated = False  # its own word counts
         if COORDINATES_ESTABLISHED in status.outputs:
             self.referenced = True
             self._operated = False
@@ -111,7 +116,7 @@ class MotionWatch:
         if self._is_reported_over(motion):
             self._reported_over = True
             self.moving = False
-        elif self._has_arrived(motion):
+        elif undisturbed and self._has_arrived(motion):  # the first time, it may have moved as the interval began
             self.moving = False
         elif not undisturbed:
             self._reported_over = False

@@ -1,4 +1,4 @@
-"""Rig-file settings of a zoom motor on an Oriental Motor AZ drive (Modbus RTU)."""
+"""Rig-file settings of a zoom motor on an Oriental Motor AZ drive."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from typing import Literal
 
 import pydantic
 
-from microdrivers.backends.lines.settings import SerialConnection
+from microdrivers.backends.modbus.register_order import ByteOrder, RegisterOrder, WordOrder
+from microdrivers.backends.modbus.settings import ModbusConnection
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import Range
 from microdrivers.devices.drivers import DeviceSettings
 from microdrivers.devices.zoom_motor import ZoomCurve
 
 
-class RtuConnection(SerialConnection):
-    """The drive's factory setting is 8 data bits, EVEN parity, 1 stop bit (HP-5142E).
+class AzConnection(ModbusConnection):
+    """The drive's factory setting is 8 data bits, EVEN parity, 1 stop bit (HP-5142E). It speaks RTU; a gateway, TCP.
 
     A reply begins within 10 ms; `timeout_s` is also the longest that a stop waits behind another exchange.
     """
@@ -34,11 +35,18 @@ class AzZoomSettings(DeviceSettings):
     The drive must have its factory assignment of inputs and outputs, except that ABSPEN (177) may take the place of
     HOME-END on R-OUT4: then `referenced` holds as long as the drive's coordinates do, and a session may begin
     without reference().
+
+    `word_order` and `byte_order` are the drive's parameter 1384h; opening checks it. `communication_timeout_s` is its
+    parameter 138Ah: a drive that hears nothing for so long stops by itself, with alarm 85h. It is written at opening,
+    to the drive's memory that forgets, and taken back at closing; null leaves it as the drive has it.
     """
 
     driver: Literal["oriental-az-zoom"] = "oriental-az-zoom"
-    connection: RtuConnection
+    connection: AzConnection
     unit_id: int = pydantic.Field(default=1, ge=1, le=31)
+    word_order: WordOrder = "high-first"
+    byte_order: ByteOrder = "big"
+    communication_timeout_s: float | None = pydantic.Field(default=None, ge=0.1, le=10.0)
     curve: tuple[tuple[int, float], ...] = pydantic.Field(min_length=2)
     zoom_range: Range
     speed_steps_s: int = pydantic.Field(gt=0, le=4_000_000)
@@ -68,3 +76,18 @@ class AzZoomSettings(DeviceSettings):
         if self.zoom_range.max < low or self.zoom_range.min > high:
             raise ValueError(f"zoom_range {self.zoom_range} has nothing in common with the curve, {low:g} to {high:g}")
         return self
+
+    @pydantic.model_validator(mode="after")
+    def _time_for_a_lost_reply(self) -> AzZoomSettings:
+        least_s = 2 * self.connection.timeout_s + 0.1
+        if self.communication_timeout_s is not None and self.communication_timeout_s < least_s:
+            raise ValueError(
+                f"communication_timeout_s {self.communication_timeout_s:g} leaves no time for a lost reply: with "
+                f"connection.timeout_s {self.connection.timeout_s:g} it must be {least_s:g} or more"
+            )
+        return self
+
+    @property
+    def register_order(self) -> RegisterOrder:
+        """How the drive puts 32-bit values into registers."""
+        return RegisterOrder(self.word_order, self.byte_order)

@@ -7,12 +7,12 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from microdrivers.backends.lines.serial_line import SerialLine
-from microdrivers.backends.oriental_az.alarms import alarm_fault
 from microdrivers.backends.oriental_az.backlash import Backlash
+from microdrivers.backends.oriental_az.communication_guard import CommunicationGuard
 from microdrivers.backends.oriental_az.drive import COORDINATES_ESTABLISHED, AzDrive, Input, Motion
+from microdrivers.backends.oriental_az.link import az_link
 from microdrivers.backends.oriental_az.motion_watch import MotionWatch
-from microdrivers.backends.oriental_az.rtu import RtuMaster, rtu_timing
+from microdrivers.backends.oriental_az.register_order_check import check_register_order
 from microdrivers.backends.oriental_az.settings import AzZoomSettings
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 
 class AzZoomMotor(ZoomMotor):
-    """A zoom motor on an Oriental Motor AZ stepper drive, over Modbus RTU.
+    """A zoom motor on an Oriental Motor AZ stepper drive, over Modbus RTU or TCP.
 
     A sample costs one exchange (11.3 ms at 115200 baud, 8E1, with the drive's factory waiting time), and a second one
     each 0.5 s and while the motor settles; see `motion_watch`. `on_target` is the drive's own word (IN-POS, no MOVE)
@@ -64,13 +64,15 @@ class AzZoomMotor(ZoomMotor):
             tolerance=settings.tolerance_steps,
         )
         self._settings = settings
-        self._line = SerialLine(
-            settings.connection,
+        self._line, self._modbus = az_link(settings, clock=clock, tap=WireTap(name, bus))
+        self._drive = AzDrive(self._modbus, settings.register_order)
+        self._guard = CommunicationGuard(
+            self._drive,
+            wanted_s=settings.communication_timeout_s,
             clock=clock,
-            gap_s=rtu_timing(settings.connection.baudrate).gap_s,
-            tap=WireTap(name, bus),
+            exchanges=lambda: self._line.counters.exchanges,
+            ask=self._poll,
         )
-        self._drive = AzDrive(RtuMaster(self._line, unit_id=settings.unit_id))
         self._backlash = Backlash(
             play_steps=settings.backlash_steps,
             tolerance_steps=settings.tolerance_steps,
@@ -101,11 +103,14 @@ class AzZoomMotor(ZoomMotor):
 
     def _identify(self) -> DeviceInfo:
         """Read what an AZ drive must be able to tell; an alarm is recorded and leaves the device open."""
+        check_register_order(self._modbus, self._settings.register_order, name=self.name)
+        self._guard.arm()
         self._observe()
         self._note_alarm(self._drive.read_alarm())
         error = self._drive.read_communication_error()
         if error:
             _log.info("%s: the drive's latest communication error is %02Xh", self.name, error)
+        self._guard.start(name=f"{self.name} keep-alive")
         return DeviceInfo(driver="oriental-az-zoom", vendor="Oriental Motor", model="AZ")
 
     @property
@@ -114,7 +119,10 @@ class AzZoomMotor(ZoomMotor):
         return vars(self._line.counters)
 
     def _close(self) -> None:
-        self._line.close()
+        try:
+            self._guard.end()
+        finally:
+            self._line.close()
 
     def _clear_fault(self) -> None:
         with self._lock:
@@ -125,7 +133,7 @@ class AzZoomMotor(ZoomMotor):
         deadline_ns = self.clock.now_ns() + seconds_to_ns(_ALARM_RESET_S)
         while code := self._drive.read_alarm():
             if self.clock.now_ns() >= deadline_ns:
-                raise alarm_fault(code, moved="no", during="the alarm could not be reset: ")
+                raise self._drive.fault(code, moved="no", during="the alarm could not be reset: ")
             self.clock.sleep(_POLL_S)
         self._alarm_code = 0
 
@@ -176,6 +184,7 @@ class AzZoomMotor(ZoomMotor):
             try:
                 if self._watch.wants_status(self.clock.now_ns()):
                     self._watch.see_status(self._drive.read_status())
+                    self._guard.keep_armed(may_be_forgotten=self._watch.may_have_restarted)
                     if not self._watch.alarm:
                         self._alarm_code = 0
                     elif not self._alarm_code:
@@ -198,7 +207,7 @@ class AzZoomMotor(ZoomMotor):
         if not code or code == self._alarm_code:
             return
         self._alarm_code = code
-        fault = alarm_fault(code, moved="maybe")
+        fault = self._drive.fault(code, moved="maybe")
         fault.device = self.name
         self.fault = fault
         if self._under_way:
@@ -263,7 +272,7 @@ class AzZoomMotor(ZoomMotor):
         """
         with self._lock, self.clock.transaction():
             if self.fault is not None:
-                raise alarm_fault(self.fault.code, moved="no", during="the motor does not move: ")
+                raise self._drive.fault(self.fault.code, moved="no", during="the motor does not move: ")
             stop_request = self._stop_request
             if self._stop_is_on:
                 self._write_input_over_stop(Input.NONE)

@@ -1,19 +1,24 @@
-"""Puts an emulated AZ drive at the other end of a zoom motor's serial port."""
+"""Puts an emulated AZ drive at the other end of a zoom motor's serial port or network connection."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from dataclasses import replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import pydantic
 
 from microdrivers.core.errors import ConfigError, UnsupportedError
-from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
+from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator, Endpoint, ServeRequest
+from microdrivers.fakes.modbus import TcpGateway
 from microdrivers.fakes.oriental_az.drive import AzDrive
-from microdrivers.fakes.oriental_az.rtu import RtuSlave
-from microdrivers.fakes.wire import Wire, forget_wire, register_wire, serve_wire
+from microdrivers.fakes.oriental_az.port import az_port
+from microdrivers.fakes.oriental_az.register_map import BYTE_WORD_ORDER
+from microdrivers.fakes.wire import Wire, WireEmulator, forget_wire, register_wire, serve_wire
 from microdrivers.fakes.world.axis import Axis
+
+_NETWORK_BAUDRATE, _NETWORK_BITS_PER_BYTE = 10**9, 8
+"""Next to the line behind the gateway, bytes on a network take no time."""
 
 
 @runtime_checkable
@@ -24,9 +29,16 @@ class ZoomWorld(Protocol):
 
 
 class _Connection(pydantic.BaseModel, extra="ignore", frozen=True):
+    """The RS-485 line; with framing `tcp`, the one behind the gateway."""
+
+    framing: Literal["rtu", "tcp"] = "rtu"
     baudrate: Literal[9600, 19200, 38400, 57600, 115200, 230400] = 115200
     parity: Literal["N", "E", "O"] = "E"
     stopbits: Literal[1, 2] = 1
+
+    @property
+    def bits_per_byte(self) -> int:
+        return 9 + self.stopbits + (self.parity != "N")
 
 
 class _Settings(pydantic.BaseModel, extra="ignore", frozen=True):
@@ -34,10 +46,17 @@ class _Settings(pydantic.BaseModel, extra="ignore", frozen=True):
 
     connection: _Connection
     unit_id: int = pydantic.Field(default=1, ge=1, le=31)
+    word_order: Literal["high-first", "low-first"] = "high-first"
+    byte_order: Literal["big", "little"] = "big"
+
+    @property
+    def byte_word_order(self) -> int:
+        """Parameter 1384h."""
+        return (self.word_order == "low-first") + 2 * (self.byte_order == "little")
 
 
 def _attach(request: EmulationRequest) -> Emulation:
-    """Build the drive and its wire `fake://NAME`.
+    """Build the drive and its wire `fake://NAME`; with framing `tcp`, a gateway stands between the two.
 
     Raises:
         UnsupportedError: the world has no zoom axis.
@@ -51,28 +70,34 @@ def _attach(request: EmulationRequest) -> Emulation:
         )
     settings = _parse(request.name, request.settings)
     connection = settings.connection
-    bits_per_byte = 9 + connection.stopbits + (connection.parity != "N")
-    slave = RtuSlave(
-        AzDrive(request.world.zoom_axis, seed=request.seed + 1),
+    drive = AzDrive(request.world.zoom_axis, seed=request.seed + 1)
+    drive.set_up(BYTE_WORD_ORDER, settings.byte_word_order)
+    port = az_port(
+        drive,
         unit_id=settings.unit_id,
         baudrate=connection.baudrate,
-        bits_per_byte=bits_per_byte,
+        bits_per_byte=connection.bits_per_byte,
         seed=request.seed,
     )
+    network = connection.framing == "tcp"
+    emulator: WireEmulator = TcpGateway(port) if network else port
     wire = Wire(
-        slave,
+        emulator,
         clock=request.clock,
         seed=request.seed,
-        baudrate=connection.baudrate,
-        bits_per_byte=bits_per_byte,
+        baudrate=_NETWORK_BAUDRATE if network else connection.baudrate,
+        bits_per_byte=_NETWORK_BITS_PER_BYTE if network else connection.bits_per_byte,
     )
     url = register_wire(request.name, wire)
+
+    def serve(where: ServeRequest) -> Endpoint:
+        return serve_wire(request.name, wire, request.clock, replace(where, transport="tcp") if network else where)
 
     return Emulation(
         overrides={"connection": {"port": url}},
         close=lambda: forget_wire(request.name, wire),
         wire_log=wire.log,
-        serve=partial(serve_wire, request.name, wire, request.clock),
+        serve=serve,
     )
 
 
@@ -83,7 +108,8 @@ def _parse(name: str, settings: Mapping[str, Any]) -> _Settings:
         first = error.errors()[0]
         raise ConfigError(
             f"{name}: the AZ drive cannot be set to {first['input']!r}: {first['msg']}",
-            remedy="use what the drive's manual allows: 9600 to 230400 baud, units 1 to 31",
+            remedy="use what the drive's manual allows: 9600 to 230400 baud, units 1 to 31, word_order high-first or "
+            "low-first, byte_order big or little; and framing rtu or tcp",
             key=".".join(str(part) for part in first["loc"]),
         ) from error
 

@@ -9,8 +9,6 @@ import numpy as np
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.fakes.world.axis import Axis, Encoder
 
-STEPS_PER_REVOLUTION = 1000
-
 _IN_POSITION_STEPS = 1.0
 _ENCODER_NOISE_STEPS = 0.15
 _START_DELAY_MS = (0.2, 2.0)
@@ -66,10 +64,7 @@ class Motor:
         delay_ms = self._random.uniform(*_START_DELAY_MS)
         self._start_ns = t_ns if self.moving(t_ns) else t_ns + round(delay_ms * NS_PER_MS)
         target = float(target_steps + self._zero_steps)
-        if start_rate == stop_rate:
-            self._axis.move(self._start_ns, target, speed=speed_hz, acceleration=start_rate)
-        else:
-            self._move_asymmetrically(self._start_ns, target, speed_hz, start_rate, stop_rate)
+        self._axis.move(self._start_ns, target, speed=speed_hz, acceleration=start_rate, deceleration=stop_rate)
 
     def stop(self, t_ns: int, *, stop_rate: float) -> None:
         """Brake to a standstill."""
@@ -88,26 +83,6 @@ class Motor:
 
         end_ns = self._axis.profile_end_ns
         return first_time(outside, self._start_ns, end_ns) if outside(end_ns) else None
-
-    def _move_asymmetrically(self, t_ns: int, target: float, speed: float, start_rate: float, stop_rate: float) -> None:
-        """Accelerate as if to a far target, and aim at the true one where braking has to begin."""
-
-        def excess(at_ns: int) -> float:
-            position, velocity = self._axis.setpoint_at(at_ns)
-            return position + velocity * abs(velocity) / (2.0 * stop_rate) - target
-
-        velocity = self._axis.setpoint_at(t_ns)[1]
-        if velocity and excess(t_ns) * velocity > 0.0:
-            t_ns = self._axis.halt(t_ns, deceleration=stop_rate)
-        if excess(t_ns) == 0.0:
-            self._axis.move(t_ns, target, speed=speed, acceleration=stop_rate)
-            return
-        sign = -1.0 if excess(t_ns) > 0.0 else 1.0
-        far = target + sign * (2.0 * max(speed, abs(velocity)) ** 2 / start_rate + 1.0)
-        end_ns = self._axis.move(t_ns, far, speed=speed, acceleration=start_rate)
-        brake_ns = max(t_ns, first_time(lambda at_ns: excess(at_ns) * sign >= 0.0, t_ns, end_ns) - 1)
-        reached = abs(self._axis.setpoint_at(brake_ns)[1])
-        self._axis.move(brake_ns, target, speed=max(speed, reached), acceleration=stop_rate)
 
 
 def first_time(condition: Callable[[int], bool], low_ns: int, high_ns: int) -> int:

@@ -2,6 +2,7 @@
 
 from microdrivers.fakes.wire.bridge import Cable, serve_wire
 from microdrivers.fakes.wire.wire import (
+    NetworkEmulator,
     Reply,
     Temper,
     Wire,
@@ -13,6 +14,7 @@ from microdrivers.fakes.wire.wire import (
 
 __all__ = [
     "Cable",
+    "NetworkEmulator",
     "Reply",
     "Temper",
     "Wire",

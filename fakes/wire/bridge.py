@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import socket
 import tty
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,6 +17,7 @@ from microdrivers.core.clock import Clock, Timer
 from microdrivers.core.errors import LinkLost, RefusedError, UnsupportedError
 from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.drivers import Endpoint, ServeRequest
+from microdrivers.devices.wire_tap import WireTap
 from microdrivers.fakes.wire.wire import Wire
 
 _CHUNK = 65536
@@ -23,6 +25,9 @@ _CHUNK = 65536
 
 class HostPort(Protocol):
     """The side of a port on which the host's bytes come out."""
+
+    def open(self) -> None:
+        """Offer the port (again), under the same name."""
 
     def descriptors(self) -> list[int]:
         """What to wait for."""
@@ -43,13 +48,14 @@ class Bridge:
     A host that does not read loses bytes, as it does on a UART: `dropped_bytes` counts them.
     """
 
-    def __init__(self, wire: Wire, clock: Clock, port: HostPort, *, name: str) -> None:
+    def __init__(self, wire: Wire, clock: Clock, port: HostPort, *, name: str, tap: WireTap | None = None) -> None:
         if clock.simulated:
             raise UnsupportedError("a simulated clock cannot serve other programs", remedy="serve on SystemClock")
         self.dropped_bytes = 0
         self._wire = wire
         self._clock = clock
         self._port = port
+        self._tap = tap
         self._wake_end, self._wake_start = os.pipe()
         self._closed = False
         wire.wakes_itself = False
@@ -74,19 +80,30 @@ class Bridge:
         while not self._closed:
             due_ns = self._wire.next_arrival_ns()
             wait_s = None if due_ns is None else max(0, due_ns - self._clock.now_ns()) / NS_PER_S
-            ready, _, _ = select.select([self._wake_end, *self._port.descriptors()], [], [], wait_s)
+            try:
+                ready, _, _ = select.select([self._wake_end, *self._port.descriptors()], [], [], wait_s)
+            except OSError as error:
+                if error.errno != errno.EBADF:
+                    raise
+                continue  # the port went away meanwhile
             if self._wake_end in ready:
                 os.read(self._wake_end, _CHUNK)
+            self._wire.turn()
             with contextlib.suppress(LinkLost):  # while the cable is pulled, bytes are lost
                 self._exchange(ready)
 
     def _exchange(self, ready: Sequence[int]) -> None:
         data = self._port.receive(ready)
         if data:
+            if self._tap is not None:
+                self._tap.sent(self._clock.now_ns(), data)
             self._wire.write(data)
         reply = self._wire.read(_CHUNK)
         if reply:
-            self.dropped_bytes += len(reply) - self._port.send(reply)
+            taken = self._port.send(reply)
+            self.dropped_bytes += len(reply) - taken
+            if self._tap is not None and taken:
+                self._tap.received(self._clock.now_ns(), reply[:taken])
 
 
 class PtyPort:
@@ -108,7 +125,7 @@ class PtyPort:
 
     def descriptors(self) -> list[int]:
         """The terminal's master side."""
-        return [self._master] if self._master >= 0 else []
+        return [descriptor for descriptor in (self._master,) if descriptor >= 0]
 
     def receive(self, ready: Sequence[int]) -> bytes:
         """Bytes from the host."""
@@ -137,24 +154,38 @@ class PtyPort:
 
 
 class TcpPort:
-    """A TCP port for one host at a time; a second one is turned away."""
+    """A TCP port for one host at a time; a second one is turned away.
 
-    def __init__(self, bind: str) -> None:
-        self._listener = socket.create_server((bind, 0))
-        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+    Args:
+        connected: called when a host has been let in, before its bytes.
+    """
+
+    def __init__(self, bind: str, connected: Callable[[], None]) -> None:
+        self.address: tuple[str, int] = (bind, 0)
+        self._connected = connected
+        self._listener: socket.socket | None = None
         self._host: socket.socket | None = None
+        self.open()
+
+    def open(self) -> None:
+        """Listen; at first on any free port, later on the same one."""
+        self._listener = socket.create_server(self.address)
+        self.address = self._listener.getsockname()[:2]
 
     def descriptors(self) -> list[int]:
         """The listener, and the host if there is one."""
-        return [self._listener.fileno(), *([self._host.fileno()] if self._host is not None else [])]
+        descriptors = [end.fileno() for end in (self._listener, self._host) if end is not None]
+        return [descriptor for descriptor in descriptors if descriptor >= 0]
 
     def receive(self, ready: Sequence[int]) -> bytes:
-        """Take a new host in; bytes from the present one."""
-        if self._listener.fileno() in ready:
-            self._greet()
-        host = self._host
-        if host is None or host.fileno() not in ready:
-            return b""
+        """Bytes from the present host; when it has said everything, take a new one in."""
+        if self._host is not None and self._host.fileno() in ready and (data := self._hear(self._host)):
+            return data
+        if self._listener is not None and self._listener.fileno() in ready:
+            self._greet(self._listener)
+        return b""
+
+    def _hear(self, host: socket.socket) -> bytes:
         try:
             data = host.recv(_CHUNK)
         except OSError:
@@ -175,36 +206,40 @@ class TcpPort:
         return len(data)
 
     def close(self) -> None:
-        """Hang up."""
-        if self._host is not None:
-            self._host.close()
-        self._listener.close()
+        """Hang up, and listen no more."""
+        ends, self._host, self._listener = (self._host, self._listener), None, None
+        for end in ends:
+            if end is not None:
+                with contextlib.suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)  # closing alone waits for whoever still looks at it
+                end.close()
 
-    def _greet(self) -> None:
-        newcomer, _ = self._listener.accept()
+    def _greet(self, listener: socket.socket) -> None:
+        newcomer, _ = listener.accept()
         if self._host is not None:
             newcomer.close()
             return
         newcomer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._host = newcomer
+        self._connected()
 
 
 class Cable:
-    """Pulls and puts back the cable of a wire that is served on a pseudo-terminal."""
+    """Pulls and puts back the cable of a wire that is served."""
 
-    def __init__(self, wire: Wire, port: PtyPort, bridge: Bridge) -> None:
+    def __init__(self, wire: Wire, port: HostPort, bridge: Bridge) -> None:
         self._wire = wire
         self._port = port
         self._bridge = bridge
 
     def unplug(self) -> None:
-        """The terminal goes away, as a USB adapter's device does."""
+        """The port goes away, as a USB adapter's device does."""
         self._wire.unplug()
         self._port.close()
         self._bridge.wake()
 
     def plug_in(self) -> None:
-        """A terminal comes back under the same name."""
+        """A port comes back under the same name."""
         self._port.open()
         self._wire.plug_in()
         self._bridge.wake()
@@ -225,9 +260,9 @@ def serve_wire(
     """
     try:
         if request.transport == "pty":
-            endpoint = _serve_on_pty(name, wire, clock, request.folder / name)
+            endpoint = _serve_on_pty(name, wire, clock, request)
         else:
-            endpoint = _serve_on_tcp(name, wire, clock, request.bind)
+            endpoint = _serve_on_tcp(name, wire, clock, request)
         return replace(endpoint, overrides={**(overrides or {}), **endpoint.overrides})
     except OSError as error:
         raise RefusedError(
@@ -235,16 +270,18 @@ def serve_wire(
         ) from error
 
 
-def _serve_on_pty(name: str, wire: Wire, clock: Clock, link: Path) -> Endpoint:
+def _serve_on_pty(name: str, wire: Wire, clock: Clock, request: ServeRequest) -> Endpoint:
+    link = request.folder / name
     port = PtyPort(link)
-    bridge = Bridge(wire, clock, port, name=name)
+    bridge = Bridge(wire, clock, port, name=name, tap=request.tap)
     # Linux pseudo-terminals hold no parity.
     overrides = {"connection": {"port": str(link), "parity": "N"}}
     return Endpoint(overrides=overrides, where=str(link), close=bridge.close, control=Cable(wire, port, bridge))
 
 
-def _serve_on_tcp(name: str, wire: Wire, clock: Clock, bind: str) -> Endpoint:
-    port = TcpPort(bind)
-    bridge = Bridge(wire, clock, port, name=name)
+def _serve_on_tcp(name: str, wire: Wire, clock: Clock, request: ServeRequest) -> Endpoint:
+    port = TcpPort(request.bind, wire.connect)
+    bridge = Bridge(wire, clock, port, name=name, tap=request.tap)
     url = f"socket://{port.address[0]}:{port.address[1]}"
-    return Endpoint(overrides={"connection": {"port": url}}, where=url, close=bridge.close)
+    overrides = {"connection": {"port": url}}
+    return Endpoint(overrides=overrides, where=url, close=bridge.close, control=Cable(wire, port, bridge))

@@ -39,7 +39,7 @@ class Serial(serial.SerialBase):  # type: ignore[misc]
         if wire.in_use:
             raise serial.SerialException(16, f"could not open port {self.portstr}: it is in use")
         wire.in_use = True
-        wire.read(wire.waiting())  # what arrived while nobody listened is lost
+        wire.connect()
         self._wire: Wire = wire
         self.is_open = True
 

@@ -6,13 +6,17 @@ import itertools
 import threading
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from functools import partial
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import LinkLost
 from microdrivers.core.units import NS_PER_S
+
+LOG_LENGTH = 100_000
+"""Records that a wire keeps: the newest; at 100 requests a second, those of the last eight minutes."""
 
 
 class Reply(NamedTuple):
@@ -35,6 +39,14 @@ class WireEmulator(Protocol):
         """When `advance` has something to do next, if ever."""
 
 
+@runtime_checkable
+class NetworkEmulator(WireEmulator, Protocol):
+    """A device that is reached over a connection, and notices when a host makes one."""
+
+    def connected(self, t_ns: int) -> None:
+        """A host connects; whatever belonged to an earlier connection is over."""
+
+
 class Temper(NamedTuple):
     """How impolite the line is: replies come in up to `max_fragments` pieces, pauses up to `max_pause_s`."""
 
@@ -49,7 +61,8 @@ class Wire:
         bits_per_byte: start, data, parity and stop bits together: 10 for 8N1, 11 for 8E1.
 
     Attributes:
-        log: what passed, as (time at which the last byte is across in ns, "host" | "device", bytes).
+        log: what passed, as (time at which the last byte is across in ns, "host" | "device", bytes); the newest
+            `LOG_LENGTH` records. Take `list(log)` while the wire is in use.
         wakes_itself: whether the wire asks the clock for its emulator's events; False where somebody else turns it.
     """
 
@@ -66,7 +79,7 @@ class Wire:
         self.emulator = emulator
         self.clock = clock
         self.byte_ns = round(bits_per_byte * NS_PER_S / baudrate)
-        self.log: list[tuple[int, str, bytes]] = []
+        self.log: deque[tuple[int, str, bytes]] = deque(maxlen=LOG_LENGTH)
         self.plugged = True
         self.in_use = False
         self.wakes_itself = True
@@ -79,6 +92,17 @@ class Wire:
         self._lock = threading.RLock()
 
     # ------------------------------------------------------------------ host side
+
+    def connect(self) -> None:
+        """A host opens its port: what arrived while nobody listened is lost.
+
+        Over a network, where a reply belongs to a connection, what is still under way is lost as well.
+        """
+        with self._lock:
+            self.read(self.waiting())
+            if isinstance(self.emulator, NetworkEmulator):
+                self._to_host.clear()
+                self.emulator.connected(self.clock.now_ns())
 
     def write(self, data: bytes) -> None:
         """The host sends bytes; they take their time on the line."""
@@ -137,17 +161,25 @@ class Wire:
 
     # ------------------------------------------------------------------ device side
 
+    def turn(self) -> None:
+        """Let happen at the emulator what is due by now, also while the cable is pulled."""
+        with self._lock:
+            self._pump(self.clock.now_ns())
+
     def _ask_to_be_woken(self) -> None:
         with self._lock:
             due_ns = self.emulator.next_event_ns()
-            if due_ns is None or due_ns == self._wake_at_ns or not self.wakes_itself:
+            if due_ns is None or not self.wakes_itself:
                 return
+            if self._wake_at_ns is not None and self._wake_at_ns <= due_ns:
+                return  # that call asks again: an event that keeps moving away costs one pending call, not many
             self._wake_at_ns = due_ns
-        self.clock.call_at(due_ns, self._wake, name="emulator")
+        self.clock.call_at(due_ns, partial(self._wake, due_ns), name="emulator")
 
-    def _wake(self) -> None:
+    def _wake(self, due_ns: int) -> None:
         with self._lock:
-            self._wake_at_ns = None
+            if self._wake_at_ns == due_ns:
+                self._wake_at_ns = None
             self._pump(self.clock.now_ns())
         self._ask_to_be_woken()
 

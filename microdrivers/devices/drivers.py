@@ -7,16 +7,17 @@ framework names none of them; a third party's package adds its own. See docs/dec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import pydantic
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
 from microdrivers.devices.base import Device
+from microdrivers.devices.wire_tap import WireTap
 
 
 class DeviceSettings(pydantic.BaseModel):
@@ -48,6 +49,19 @@ class World(Protocol):
 
     def close(self) -> None:
         """Release what the world holds."""
+
+
+@runtime_checkable
+class WorldWithEmulators(World, Protocol):
+    """A world that brings its own emulators instead of the drivers': a replay.
+
+    Attributes:
+        emulators: by the device's name; devices that are not among them are left out of the rig.
+        starts_anew: whether its devices are as after power-on whenever the rig is built.
+    """
+
+    emulators: Mapping[str, Emulator]
+    starts_anew: bool
 
 
 @dataclass(frozen=True)
@@ -96,11 +110,17 @@ class ServeRequest:
         transport: of serial lines: pseudo-terminals or TCP ports. Cameras are served over HTTP in either case.
         bind: address for TCP and HTTP.
         folder: where stable names of pseudo-terminals are made.
+        tap: is told what passes on a serial line, if somebody wants to know.
+        can: of CAN buses: a serial adapter on a `transport` of its own, or an existing SocketCAN interface.
+        can_channel: that interface's name.
     """
 
     transport: Literal["pty", "tcp"]
     bind: str
     folder: Path
+    tap: WireTap | None = None
+    can: Literal["slcan", "socketcan"] = "slcan"
+    can_channel: str = "vcan0"
 
 
 @dataclass(frozen=True)
@@ -127,13 +147,14 @@ class Emulation:
     Attributes:
         overrides: merged over the device's settings, so that the driver connects to the emulator.
         close: ends the emulator.
-        wire_log: what passed on the wire, as (t_ns, "host" | "device", bytes), if the device has one.
+        wire_log: what passed on the wire of late, as (t_ns, "host" | "device", bytes), if the device has one. It
+            grows at one end and may shrink at the other: take `list(wire_log)` while the device is in use.
         serve: puts the emulator on an operating-system port, if it can.
     """
 
     overrides: Mapping[str, Any]
     close: Callable[[], None]
-    wire_log: list[tuple[int, str, bytes]] = field(default_factory=list)
+    wire_log: Collection[tuple[int, str, bytes]] = field(default_factory=list)
     serve: Callable[[ServeRequest], Endpoint] | None = None
 
 

@@ -13,7 +13,7 @@ from microdrivers.core.samples import DeviceEvent, ZoomSample
 from microdrivers.core.units import Range
 from microdrivers.devices.zoom_motor import ZoomCurve
 from microdrivers.fakes.wire import WireEmulator
-from tests.backends.oriental_az_peer import SheetDrive, plug_in
+from tests.backends.oriental_az_peer import Gateway, SheetDrive, plug_in
 
 CURVE = ((-500, 0.75), (4000, 3.0), (12_000, 11.25))
 STOP_ON = bytes.fromhex("0106007D0020180A")
@@ -26,9 +26,11 @@ class Bench:
     def __init__(self, drive: WireEmulator | None = None, *, clock: Clock | None = None, **changes: Any) -> None:
         self.drive = SheetDrive(position=1000) if drive is None else drive
         self.clock = SimulatedClock() if clock is None else clock
-        url, self.wire = plug_in(self.drive, self.clock)
+        connection = changes.pop("connection", {})
+        behind_gateway = connection.get("framing") == "tcp"
+        url, self.wire = plug_in(Gateway(self.drive) if behind_gateway else self.drive, self.clock)
         values: dict[str, Any] = {
-            "connection": {"port": url} | changes.pop("connection", {}), "curve": CURVE,
+            "connection": {"port": url} | connection, "curve": CURVE,
             "zoom_range": Range(0.8, 10.0), "speed_steps_s": 20_000, "acceleration_steps_s2": 1_000_000,
         }  # fmt: skip
         bus = Bus()

@@ -38,14 +38,46 @@ def plug_in(
     return register_wire(f"az-test-{next(_names)}", wire), wire
 
 
-class Script:
-    """Answers the n-th request with the n-th list of (seconds after the request's last bit, bytes)."""
+class Gateway:
+    """A Modbus TCP gateway with RTU units behind it."""
 
-    def __init__(self, *answers: Sequence[tuple[float, bytes]]) -> None:
-        self.requests: list[bytes] = []
-        self._answers = list(answers)
+    def __init__(self, unit: WireEmulator) -> None:
+        self._unit = unit
 
     def receive(self, data: bytes, start_ns: int, end_ns: int) -> Sequence[Reply]:
+        replies = self._unit.receive(with_crc(data[6:]), end_ns, end_ns + NS_PER_MS)
+        return [
+            Reply(t_ns, data[:4] + struct.pack(">H", len(reply) - 2) + reply[:-2]) for t_ns, reply in replies if reply
+        ]
+
+    def advance(self, t_ns: int) -> Sequence[Reply]:
+        return self._unit.advance(t_ns)
+
+    def next_event_ns(self) -> int | None:
+        return self._unit.next_event_ns()
+
+
+class Script:
+    """Answers the n-th request with the n-th list of (seconds after the request's last bit, bytes).
+
+    A mark (function 08h) is echoed like by any unit, and counted apart, unless `marks` is a script of its own for them.
+    """
+
+    def __init__(
+        self, *answers: Sequence[tuple[float, bytes]], marks: Sequence[Sequence[tuple[float, bytes]]] | None = None
+    ) -> None:
+        self.requests: list[bytes] = []
+        self.marks: list[bytes] = []
+        self._answers = list(answers)
+        self._mark_answers = None if marks is None else list(marks)
+
+    def receive(self, data: bytes, start_ns: int, end_ns: int) -> Sequence[Reply]:
+        if data[1] == 0x08:
+            self.marks.append(data)
+            if self._mark_answers is None:
+                return [Reply(end_ns + ANSWER_NS, data)]
+            answer = self._mark_answers.pop(0) if self._mark_answers else ()
+            return [Reply(end_ns + round(delay_s * NS_PER_S), piece) for delay_s, piece in answer]
         self.requests.append(data)
         answer = self._answers.pop(0) if self._answers else ()
         return [Reply(end_ns + round(delay_s * NS_PER_S), piece) for delay_s, piece in answer]
@@ -73,12 +105,18 @@ class SheetDrive:
     Args:
         home_end_holds: R-OUT4 is ABSPEN (on while the coordinates hold) instead of HOME-END (off from the start of
             an operation on).
+        order: the byte & word order in use; `stored_order` is the parameter, which may wait for a power cycle.
     """
 
     LAG_NS = 25 * NS_PER_MS
+    ORDERS = ((0, 1, 2, 3), (2, 3, 0, 1), (1, 0, 3, 2), (3, 2, 1, 0))
 
-    def __init__(self, *, home_end_holds: bool = True, position: int = 0) -> None:
+    def __init__(self, *, home_end_holds: bool = True, position: int = 0, order: int = 0) -> None:
         self.home_end_holds = home_end_holds
+        self.order = self.stored_order = order
+        self.communication_timeout_ms = 0
+        self.takes_parameters = True
+        self.heard_ns = 0
         self.established = True
         self.at_home = True
         self.alarm = 0
@@ -115,17 +153,21 @@ class SheetDrive:
     @property
     def commanded_positions(self) -> list[int]:
         blocks = [data for data in self.requests if data[1:4] == bytes.fromhex("100058")]
-        return [struct.unpack(">i", data[15:19])[0] for data in blocks]
+        return [self._values(data[7:-2])[2] for data in blocks]
 
     def power_cycle(self) -> None:
         self.established = self.at_home = False
         self.input = 0
+        self.communication_timeout_ms = 0
 
     # ------------------------------------------------------------------ the wire
 
     def receive(self, data: bytes, start_ns: int, end_ns: int) -> Sequence[Reply]:
         self.requests.append(data)
-        if self.deaf or data[0] != 1 or with_crc(data[:-2]) != data:
+        if self.deaf or with_crc(data[:-2]) != data:
+            return ()
+        self.heard_ns = end_ns
+        if data[0] != 1:
             return ()
         reply = with_crc(b"\x01" + self._answer(data[1:-2], end_ns + SILENCE_NS))
         if self.spoil:
@@ -133,20 +175,35 @@ class SheetDrive:
         return [Reply(end_ns + ANSWER_NS, reply)] if reply else ()
 
     def advance(self, t_ns: int) -> Sequence[Reply]:
+        self.alarm = 0x85
+        self.halt(t_ns)
         return ()
 
     def next_event_ns(self) -> int | None:
-        return None
+        if self.alarm or not self.communication_timeout_ms:
+            return None
+        return self.heard_ns + self.communication_timeout_ms * NS_PER_MS
 
     def _answer(self, pdu: bytes, t_ns: int) -> bytes:
         function, address, count = struct.unpack(">BHH", pdu[:5])
         if function == 0x03:
-            words = [self._register(address + i, t_ns) for i in range(count)]
-            return struct.pack(f">BB{count}H", function, 2 * count, *words)
+            assert address % 2 == count % 2 == 0
+            data = b"".join(self._pair(self._value(address + i, t_ns)) for i in range(0, count, 2))
+            return bytes((function, len(data))) + data
         if function == 0x06:
+            assert (address, self.order) == (0x7D, 0)
             self._write_input(count, t_ns)
             return pdu
-        values = struct.unpack(f">{count // 2}i", pdu[6:])
+        if function == 0x08:
+            return pdu
+        values = self._values(pdu[6:])
+        if address == 0x7C:
+            self._write_input(values[0], t_ns)
+            return pdu[:5]
+        if address == 0x138A:
+            self.communication_timeout_ms = values[0] if self.takes_parameters else 0
+            return pdu[:5]
+        assert address == 0x58
         if self.alarm or values[4] < 1 or values[3] > 4_000_000:
             self.communication_error = 0x8D if self.alarm else 0x8C
             return bytes((function | 0x80, 4))
@@ -154,8 +211,8 @@ class SheetDrive:
             self._run(values[2], values[3], t_ns)
         return pdu[:5]
 
-    def _register(self, address: int, t_ns: int) -> int:
-        pairs = {
+    def _value(self, address: int, t_ns: int) -> int:
+        values = {
             0x7E: self._outputs(t_ns),
             0x80: self.alarm,
             0xAC: self.communication_error,
@@ -163,9 +220,20 @@ class SheetDrive:
             0xC8: 60 if self._runs(t_ns) else 0,
             0xCA: 1000 if self._runs(t_ns) else 0,
             0xCC: self.feedback(t_ns),
+            0x1384: self.stored_order,
+            0x138A: self.communication_timeout_ms,
         }
-        value = pairs[address & ~1] & 0xFFFFFFFF
-        return value & 0xFFFF if address & 1 else value >> 16
+        return values[address]
+
+    def _pair(self, value: int) -> bytes:
+        """Two registers as the manual's table of byte & word orders has them."""
+        data = struct.pack(">I", value & 0xFFFFFFFF)
+        return bytes(data[i] for i in self.ORDERS[self.order])
+
+    def _values(self, data: bytes) -> list[int]:
+        place = [self.ORDERS[self.order].index(i) for i in range(4)]
+        pairs = (data[i : i + 4] for i in range(0, len(data), 4))
+        return [struct.unpack(">i", bytes(pair[i] for i in place))[0] for pair in pairs]
 
     def _outputs(self, t_ns: int) -> int:
         self._finish_homing(t_ns)

@@ -67,6 +67,25 @@ def test_only_a_status_without_move_and_with_arrival_ends_a_motion(feed: Feed) -
     assert feed.watch.in_position
 
 
+def test_arrival_ends_a_motion_with_the_second_sample_that_shows_it(feed: Feed) -> None:
+    """The interval of the first may have begun while the motor still moved."""
+    feed.watch.commanded(200)
+    assert feed.motion(150, 140, speed=500)
+    assert feed.motion(200, 200)
+    assert not feed.motion(200, 199)
+    assert not feed.watch.in_position  # the drive's own word
+
+
+def test_a_short_silence_is_no_restart(feed: Feed) -> None:
+    for silence_ms, restarted in ((900, False), (1100, True)):
+        feed.watch.link_failed()
+        feed.t_ms += silence_ms - 10
+        feed.status(AT_REST)
+        assert feed.watch.may_have_restarted is restarted
+    feed.status(AT_REST)
+    assert not feed.watch.may_have_restarted
+
+
 def test_a_motion_that_goes_on_outweighs_the_status_before_it(feed: Feed) -> None:
     feed.watch.commanded()
     feed.status(AT_REST)

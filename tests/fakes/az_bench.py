@@ -1,4 +1,4 @@
-"""An emulated AZ drive on the bench: requests go in as bytes at given times."""
+"""An emulated AZ drive on the bench, alone or behind a gateway: requests go in as bytes at given times."""
 
 from __future__ import annotations
 
@@ -6,14 +6,35 @@ import struct
 from collections.abc import Sequence
 
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
-from microdrivers.fakes.oriental_az.drive import INT32, AzDrive
-from microdrivers.fakes.oriental_az.rtu import RtuSlave, frame
-from microdrivers.fakes.wire import Reply
+from microdrivers.fakes.modbus import RtuSlave, TcpGateway, frame
+from microdrivers.fakes.oriental_az.drive import AzDrive
+from microdrivers.fakes.oriental_az.port import az_port
+from microdrivers.fakes.oriental_az.register_map import INT32
+from microdrivers.fakes.wire import Reply, WireEmulator, wire_named
 from microdrivers.fakes.world.axis import Axis
 
 UNIT = 1
 ZHOME, STOP, FREE, ALARM_RESET = 0x10, 0x20, 0x40, 0x80
 HOME_END, READY, ALARM, BUSY, MOVE, IN_POSITION = 0x10, 0x20, 0x80, 0x100, 0x2000, 0x4000
+
+
+class ZoomOnlyWorld:
+    """The world of a rig that is nothing but a zoom."""
+
+    def __init__(self) -> None:
+        self.zoom_axis = Axis(0.0, lag_s=0.003)
+
+    def close(self) -> None: ...
+
+
+def drive_behind(name: str) -> AzDrive:
+    """The drive at the end of `fake://NAME`, with a gateway in front of it or not."""
+    wire = wire_named(name)
+    assert wire is not None
+    slave = wire.emulator.slave if isinstance(wire.emulator, TcpGateway) else wire.emulator
+    assert isinstance(slave, RtuSlave)
+    assert isinstance(slave.device, AzDrive)
+    return slave.device
 
 
 class AzBench:
@@ -30,7 +51,8 @@ class AzBench:
         self.byte_ns = round(11 * NS_PER_S / baudrate)
         self.axis = Axis(0.0, lag_s=lag_s)
         self.drive = AzDrive(self.axis, seed=seed, software_limits_steps=software_limits_steps)
-        self.slave = RtuSlave(self.drive, unit_id=UNIT, baudrate=baudrate, bits_per_byte=11, seed=seed)
+        self.slave = az_port(self.drive, unit_id=UNIT, baudrate=baudrate, bits_per_byte=11, seed=seed)
+        self.port: WireEmulator = self.slave
         self.t_ns = NS_PER_S
         self.sent_ns = 0
 
@@ -40,7 +62,7 @@ class AzBench:
     def put(self, data: bytes) -> list[Reply]:
         """Send bytes from `t_ns` on, and move `t_ns` to their end."""
         self.sent_ns = self.t_ns + len(data) * self.byte_ns
-        replies = list(self.slave.receive(data, self.t_ns, self.sent_ns))
+        replies = list(self.port.receive(data, self.t_ns, self.sent_ns))
         self.t_ns = self.sent_ns
         return replies
 
@@ -48,8 +70,8 @@ class AzBench:
         """Wait in silence, event by event, as the wire does."""
         end_ns = self.t_ns + round(milliseconds * NS_PER_MS)
         replies = []
-        while (due_ns := self.slave.next_event_ns()) is not None and due_ns <= end_ns:
-            replies += self.slave.advance(due_ns)
+        while (due_ns := self.port.next_event_ns()) is not None and due_ns <= end_ns:
+            replies += self.port.advance(due_ns)
         self.t_ns = end_ns
         return replies
 
@@ -97,6 +119,29 @@ class AzBench:
 
     def texts(self) -> list[str]:
         return [text for _, text in self.drive.log]
+
+
+class GatewayBench(AzBench):
+    """The same drive behind a gateway. What is asked, and the reply, are still written as RTU frames."""
+
+    def __init__(self, *, baudrate: int = 115200, seed: int = 1) -> None:
+        super().__init__(baudrate=baudrate, seed=seed)
+        self.gateway = TcpGateway(self.slave)
+        self.port = self.gateway
+        self.byte_ns = 8
+        self.transaction = 0
+
+    def ask(self, request: bytes) -> bytes:
+        self.transaction += 1
+        reply = super().ask(adu(self.transaction, request[0], request[1:-2]))
+        assert reply[:4] == struct.pack(">HH", self.transaction, 0)
+        assert int.from_bytes(reply[4:6], "big") == len(reply) - 6
+        return frame(reply[6], reply[7:])
+
+
+def adu(transaction: int, unit_id: int, pdu: bytes) -> bytes:
+    """A Modbus TCP request or reply."""
+    return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit_id) + pdu
 
 
 def write_request(address: int, values: Sequence[int]) -> bytes:

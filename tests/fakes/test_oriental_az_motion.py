@@ -1,4 +1,4 @@
-"""The emulated AZ drive: motion and its timing, stopping, alarms and coordinates."""
+"""The emulated AZ drive: motion and its timing, stopping, homing and coordinates."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
-from microdrivers.fakes.oriental_az.rtu import frame
+from microdrivers.fakes.modbus import frame
 from tests.fakes.az_bench import (
-    ALARM,
-    ALARM_RESET,
     BUSY,
     FREE,
     HOME_END,
@@ -258,75 +256,3 @@ def test_start_runs_the_selected_data(bench: AzBench) -> None:
     bench.inputs(0x3 | 0x8)
     assert bench.outputs() & 0xF == 0xB
     assert bench.texts() == ["start data 3"]
-
-
-# ---------------------------------------------------------------------- alarms
-
-
-@pytest.mark.parametrize("by_register", [False, True])
-@pytest.mark.parametrize(("code", "clears"), [(0x30, True), (0x26, True), (0x28, False), (0x41, False)])
-def test_alarms_stop_the_motor_and_some_can_be_reset(
-    bench: AzBench, code: int, clears: bool, by_register: bool
-) -> None:
-    bench.move(100_000)
-    bench.wait_ms(100)
-    bench.drive.raise_alarm(bench.t_ns, code)
-    bench.wait_ms(500)
-    assert bench.outputs() == IN_POSITION | ALARM | HOME_END
-    assert bench.move(0) == 4
-    assert bench.read(0xAC) == 0x8D
-    if by_register:
-        bench.write(0x180, 1)
-    else:
-        bench.inputs(ALARM_RESET)
-    assert bench.read(0x80) == (0 if clears else code)
-    assert bool(bench.outputs() & READY) is clears
-
-
-def test_alarm_reset_needs_an_edge(bench: AzBench) -> None:
-    bench.write(0x180, 1)
-    bench.drive.raise_alarm(bench.t_ns, 0x30)
-    bench.write(0x180, 1)
-    assert bench.read(0x80) == 0x30
-    bench.write(0x180, 0)
-    bench.write(0x180, 1)
-    assert bench.read(0x80) == 0
-
-
-def test_alarm_history_keeps_the_newest_first_until_cleared(bench: AzBench) -> None:
-    for code in (0x30, 0x26):
-        bench.drive.raise_alarm(bench.t_ns, code)
-        bench.inputs(ALARM_RESET)
-        bench.inputs(0)
-    assert [bench.read(address) for address in (0x80, 0x82, 0x84, 0x94)] == [0, 0x26, 0x30, 0]
-    bench.write(0x184, 1)
-    assert bench.read(0x82) == 0
-
-
-def test_software_limits_stop_the_motor() -> None:
-    bench = AzBench(software_limits_steps=(-100, 5000))
-    bench.move(8500, stop_rate=500_000)
-    bench.listen(1000)
-    assert bench.read(0x80) == 0x67
-    assert bench.read(0xC6) == pytest.approx(5000 + 20_000**2 / (2 * 500_000), abs=1)
-    bench.inputs(ALARM_RESET)
-    assert bench.move(0) == 0
-    bench.listen(1000)
-    assert bench.read(0xC6) == 0
-    assert bench.texts() == ["move 8500", "alarm 67", "alarm reset", "move 0"]
-
-
-def test_silence_of_the_host_is_an_alarm_if_asked_for(bench: AzBench) -> None:
-    bench.wait_ms(60_000)
-    assert bench.read(0x80) == 0
-    bench.write(0x138A, 200)
-    bench.move(100_000)
-    bench.listen(100)
-    assert bench.read(0x80) == 0
-    (heard_ns,) = [t_ns for t_ns, text in bench.drive.log if text == "move 100000"]
-    assert heard_ns < bench.sent_ns
-    bench.listen(1000)
-    t_ns, text = bench.drive.log[-1]
-    assert text == "alarm 85"
-    assert t_ns - bench.sent_ns == pytest.approx(202.5 * NS_PER_MS, abs=NS_PER_MS)
-    assert not bench.outputs() & MOVE

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 import serial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from microdrivers.core.clock import SimulatedClock
+from microdrivers.core.clock import SimulatedClock, Timer
 from microdrivers.core.errors import LinkLost
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
 from microdrivers.fakes.wire import Reply, Temper, Wire, forget_wire, register_wire, wire_named
@@ -69,7 +69,7 @@ def test_bytes_take_their_time_both_ways(clock: SimulatedClock, wire: Wire) -> N
     wire.write(b"hello")
     sent_ns = NS_PER_S + 5 * BYTE_NS
     back_ns = sent_ns + DELAY_NS + 5 * BYTE_NS
-    assert wire.log == [(sent_ns, "host", b"hello"), (back_ns, "device", b"hello")]
+    assert list(wire.log) == [(sent_ns, "host", b"hello"), (back_ns, "device", b"hello")]
     assert wire.next_arrival_ns() == back_ns
     clock.sleep_until(back_ns - 1)
     assert (wire.waiting(), wire.read(99)) == (0, b"")
@@ -137,6 +137,94 @@ def test_an_event_during_an_exchange_is_not_late(clock: SimulatedClock, port: se
         port.write(b"T")
         assert port.read(3) == b"..."
         assert clock.now_ns() == NS_PER_S + BYTE_NS + 30 * NS_PER_MS + BYTE_NS
+
+
+class Watchdog:
+    """Barks when it has heard nothing for 100 ms."""
+
+    def __init__(self) -> None:
+        self.heard_ns: int | None = None
+        self.barks: list[int] = []
+        self.connections: list[int] = []
+
+    def receive(self, data: bytes, start_ns: int, end_ns: int) -> Sequence[Reply]:
+        self.heard_ns = end_ns
+        return (Reply(end_ns + DELAY_NS, data),)
+
+    def advance(self, t_ns: int) -> Sequence[Reply]:
+        self.heard_ns = None
+        self.barks.append(t_ns)
+        return (Reply(t_ns, b"!"),)
+
+    def next_event_ns(self) -> int | None:
+        return None if self.heard_ns is None else self.heard_ns + 100 * NS_PER_MS
+
+
+class NetworkWatchdog(Watchdog):
+    """One that notices connections."""
+
+    def connected(self, t_ns: int) -> None:
+        self.connections.append(t_ns)
+
+
+class CountingClock(SimulatedClock):
+    """Counts what it is asked to call."""
+
+    calls = 0
+
+    def call_at(self, t_ns: int, call: Callable[[], object], *, name: str = "") -> Timer:
+        self.calls += 1
+        return super().call_at(t_ns, call, name=name)
+
+
+def test_an_event_that_moves_away_is_not_asked_for_again_and_again() -> None:
+    clock = CountingClock(start_ns=NS_PER_S)
+    watchdog = Watchdog()
+    wire = Wire(watchdog, clock=clock, seed=1, baudrate=9600)
+    for _ in range(1000):
+        wire.write(b"a")
+        clock.sleep(0.01)
+    assert clock.calls <= 1 + 1000 * 10 // 90  # one pending call at a time, each lasts until the due time it knew
+    last_ns = watchdog.heard_ns
+    assert last_ns is not None
+    assert watchdog.barks == []
+    clock.sleep(1.0)
+    assert watchdog.barks == [last_ns + 100 * NS_PER_MS]
+
+
+def test_events_happen_while_the_cable_is_pulled(clock: SimulatedClock) -> None:
+    watchdog = Watchdog()
+    wire = Wire(watchdog, clock=clock, seed=1, baudrate=9600)
+    wire.wakes_itself = False  # somebody else turns it
+    wire.write(b"a")
+    wire.unplug()
+    clock.sleep(1.0)
+    assert watchdog.barks == []
+    wire.turn()
+    assert len(watchdog.barks) == 1
+    wire.plug_in()
+    assert wire.waiting() == 0
+
+
+@pytest.mark.parametrize(("watchdog", "heard"), [(Watchdog(), b"a"), (NetworkWatchdog(), b"")])
+def test_only_a_network_forgets_what_is_under_way(clock: SimulatedClock, watchdog: Watchdog, heard: bytes) -> None:
+    wire = Wire(watchdog, clock=clock, seed=1, baudrate=9600)
+    wire.write(b"a")
+    wire.connect()
+    clock.sleep(0.05)
+    assert wire.read(9) == heard
+    assert watchdog.connections == ([NS_PER_S] if isinstance(watchdog, NetworkWatchdog) else [])
+
+
+def test_the_log_keeps_the_newest_records(clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Wire(Watchdog(), clock=clock, seed=1, baudrate=9600).log.maxlen == 100_000
+    monkeypatch.setattr("microdrivers.fakes.wire.wire.LOG_LENGTH", 10)
+    wire = Wire(Watchdog(), clock=clock, seed=1, baudrate=9600)
+    for number in range(20):
+        wire.write(bytes((number,)))
+    assert [(who, data[0]) for _, who, data in wire.log] == [
+        (who, n) for n in range(15, 20) for who in ("host", "device")
+    ]
 
 
 # ---------------------------------------------------------------------- the port

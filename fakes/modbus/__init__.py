@@ -1,0 +1,29 @@
+"""The Modbus side of emulated devices, whatever they are: an RTU slave, and a TCP gateway in front of one."""
+
+from microdrivers.fakes.modbus.functions import (
+    Function,
+    ModbusException,
+    diagnose,
+    read_registers,
+    read_write_registers,
+    write_register,
+    write_registers,
+)
+from microdrivers.fakes.modbus.gateway import TcpGateway
+from microdrivers.fakes.modbus.rtu import ModbusDevice, RtuSlave, SlaveTiming, crc16, frame
+
+__all__ = [
+    "Function",
+    "ModbusDevice",
+    "ModbusException",
+    "RtuSlave",
+    "SlaveTiming",
+    "TcpGateway",
+    "crc16",
+    "diagnose",
+    "frame",
+    "read_registers",
+    "read_write_registers",
+    "write_register",
+    "write_registers",
+]
