@@ -12,6 +12,7 @@ import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
 from microdrivers.cli.progress import TerminalProgress
+from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
 
 if TYPE_CHECKING:
     from microdrivers.routines.optics.source import OpticsSource
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 @click.option("--frames", type=click.IntRange(min=10), default=100, show_default=True, help="Frames on the circle.")
 @click.option("--settled/--in-motion", default=None, help="Take frames at rest, or never; default: as times are known.")
 @click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
+@click.option("--wire-log", type=click.Path(path_type=Path), metavar="FILE", help=WIRE_LOG_HELP)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON instead of a summary.")
 def optics(
     rig_file: Path | None,
@@ -44,6 +46,7 @@ def optics(
     frames: int,
     settled: bool | None,
     real_time: bool,
+    wire_log: Path | None,
     as_json: bool,
 ) -> None:
     r"""Calibrate camera to stage on line while the zoom changes (Bilen et al., section III.B).
@@ -60,10 +63,11 @@ def optics(
       microdrivers calibrate optics --rig lab.yaml --fake    the same rig, emulated
       microdrivers calibrate optics --images recording/      a recorded sequence
     """
+    from microdrivers.configs import shipped_rig
     from microdrivers.core.errors import ConfigError
 
-    if images is not None and (rig_file is not None or fake or real_time):
-        raise ConfigError("--images replaces the rig", remedy="leave out --rig, --fake and --real-time")
+    if images is not None and (rig_file is not None or fake or real_time or wire_log is not None):
+        raise ConfigError("--images replaces the rig", remedy="leave out --rig, --fake, --real-time and --wire-log")
     progress = TerminalProgress(quiet=as_json)
     try:
         if images is not None:
@@ -76,7 +80,8 @@ def optics(
                 "frames": frames,
                 "settled": settled,
             }
-            complete = _on_rig(rig_file, fake, seed, world, out, circle, real_time, as_json, progress)
+            choice = RigChoice(rig_file or shipped_rig(), fake or rig_file is None, seed, world, wire_log)
+            complete = _on_rig(choice, out, circle, real_time, as_json, progress)
     finally:
         progress.close()
     if not complete:
@@ -94,24 +99,20 @@ def _from_images(folder: Path, out: Path | None, as_json: bool, progress: Termin
 
 
 def _on_rig(
-    rig_file: Path | None,
-    fake: bool,
-    seed: int,
-    world: Path | None,
+    choice: RigChoice,
     out: Path | None,
     circle: dict[str, Any],
     real_time: bool,
     as_json: bool,
     progress: TerminalProgress,
 ) -> bool:
-    from microdrivers.configs import shipped_rig
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
     from microdrivers.routines.optics import CircleExperiment, CircleSettings
 
-    fake = fake or rig_file is None
+    file, fake, seed, world, wire_log, _ = choice
     clock = SimulatedClock() if fake and not real_time else SystemClock()
-    with open_rig(rig_file or shipped_rig(), fake=fake, seed=seed, clock=clock, world=world) as rig:
+    with open_rig(file, fake=fake, seed=seed or 0, clock=clock, world=world, wire_log=wire_log) as rig:
         settings = CircleSettings(**circle)
         provenance = {
             "source": "emulated rig" if fake else "emulated rig on ports" if rig.file.emulated else "live rig",

@@ -60,7 +60,7 @@ def doctor(choice: RigChoice, motion: bool, yes: bool, as_json: bool) -> None:
     if as_json:
         click.echo(msgspec.json.format(msgspec.json.encode(diagnosis), indent=2).decode())
     else:
-        for line in _lines(diagnosis):
+        for line in _lines(diagnosis, _where(choice)):
             click.echo(line)
     if diagnosis.count("problem"):
         sys.exit(EXIT_ERROR)
@@ -76,8 +76,13 @@ def _ask_for_the_way(rig: Rig) -> None:
         click.confirm(what, abort=True, err=True)
 
 
-def _lines(diagnosis: Diagnosis) -> Iterator[str]:
-    where = "emulated, simulated clock" if diagnosis.fake else "hardware"
+def _where(choice: RigChoice) -> str:
+    if choice.wire_replay is not None:
+        return f"replayed from {choice.wire_replay}"
+    return "emulated, simulated clock" if choice.fake else "hardware"
+
+
+def _lines(diagnosis: Diagnosis, where: str) -> Iterator[str]:
     yield f"rig {diagnosis.rig} ({diagnosis.file}), {where}"
     for device in diagnosis.devices:
         yield ""

@@ -103,7 +103,7 @@ def _axes(given: dict[str, float]) -> list[str]:
 
 def _reference_emulated(rig: Rig, stage: XYThetaStage, given: dict[str, float]) -> None:
     unknown = [axis for axis in _axes(given) if not stage.referenced[axis]]
-    if rig.fake and unknown:
+    if rig.starts_anew and unknown:
         click.echo(f"· referencing {', '.join(unknown)} of the emulated stage first", err=True)
         stage.reference(unknown)
 

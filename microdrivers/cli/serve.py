@@ -8,6 +8,8 @@ from typing import Literal
 
 import click
 
+from microdrivers.cli.rig_options import WIRE_LOG_HELP
+
 
 @click.command(short_help="Put every emulator of a rig on a port for other programs.")
 @click.argument("rig", type=click.Path(path_type=Path))
@@ -23,6 +25,9 @@ import click
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
+@click.option(
+    "--wire-log", type=click.Path(path_type=Path), metavar="FILE", help=f"{WIRE_LOG_HELP} As the emulators see it."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the endpoints as JSON.")
 def serve(
     rig: Path,
@@ -32,6 +37,7 @@ def serve(
     duration_s: float | None,
     seed: int,
     world: Path | None,
+    wire_log: Path | None,
     as_json: bool,
 ) -> None:
     r"""Emulate the rig file RIG in real time and let other programs use it.
@@ -47,7 +53,8 @@ def serve(
     from microdrivers.rig import load_rig_file
     from microdrivers.rig.serving import ServedRig
 
-    with ServedRig(load_rig_file(rig), seed=seed, world=world, transport=transport, bind=bind) as running:
+    description = load_rig_file(rig)
+    with ServedRig(description, seed=seed, world=world, transport=transport, bind=bind, wire_log=wire_log) as running:
         if served is not None:
             running.write(served)
         where = {name: endpoint.where for name, endpoint in running.endpoints.items()}

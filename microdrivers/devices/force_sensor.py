@@ -14,9 +14,11 @@ from microdrivers.core.errors import LinkTimeout, RefusedError, SaturatedData
 from microdrivers.core.samples import ForceSample, TimeSource
 from microdrivers.core.units import NS_PER_S, Range, check_range
 from microdrivers.devices.base import Device
+from microdrivers.devices.force_sensor_settings import ForceSensorSettings
 
 SATURATED, DISCONNECTED, STALE, UNTARED = "SATURATED", "DISCONNECTED", "STALE", "UNTARED"
 INVALID = frozenset({SATURATED, DISCONNECTED, STALE})
+_NOT_OF_A_SENSOR = frozenset({DISCONNECTED, STALE})
 
 TARE_DURATIONS_S = Range(0.05, 60.0)
 _FEWEST_READINGS = 8
@@ -38,8 +40,8 @@ class Tare(msgspec.Struct, frozen=True, kw_only=True):
 class ForceSensor(Device[ForceSample]):
     """One axis of force, µN; two axes are two sensors.
 
-    A driver supplies the hooks of `Device`, fills the attributes when it opens, and makes its samples with `_sample`.
-    Nothing is tared by itself.
+    A driver supplies the hooks of `Device`, fills the attributes (`_adopt`), and makes its samples with `_sample`.
+    Nothing is tared by itself. While a stream is open and no reading comes, samples without a force say so: STALE.
 
     Attributes:
         range_uN: beyond it a reading is SATURATED.
@@ -95,11 +97,20 @@ class ForceSensor(Device[ForceSample]):
 
     # ------------------------------------------------------------------ for drivers
 
+    def _adopt(self, settings: ForceSensorSettings) -> None:
+        """Take over what the rig file says."""
+        self.range_uN = settings.range_uN
+        self.resolution_uN = settings.resolution_uN
+        self.bandwidth_hz = settings.bandwidth_hz
+        self.stiffness_uN_per_um = settings.stiffness_uN_per_um
+        self.axis = settings.axis
+        self.stream_rate_hz = settings.rate_hz
+
     def _sample(
         self, raw_uN: float, *, t_ns: int, dt_ns: int, t_source: TimeSource, flags: frozenset[str] = frozenset()
     ) -> ForceSample:
-        """A sample from a raw reading; NaN and a flag beyond the range."""
-        if not raw_uN <= self.range_uN.max or not raw_uN >= self.range_uN.min:
+        """A sample from a raw reading: no force, and a flag, beyond the range; nothing is judged without a sensor."""
+        if not flags & _NOT_OF_A_SENSOR and not self.range_uN.min <= raw_uN <= self.range_uN.max:
             flags |= {SATURATED}
         tare = self._tare
         if tare is None:
@@ -116,6 +127,18 @@ class ForceSensor(Device[ForceSample]):
             raw_uN=raw_uN,
             tare_uN=offset_uN,
         )
+
+    def _publish_stale(self) -> None:
+        """Say that no reading has come in time."""
+        sample = self._sample(
+            math.nan, t_ns=self.clock.now_ns(), dt_ns=0, t_source="computed", flags=frozenset({STALE})
+        )
+        self.clock.deliver(lambda: self.topic.publish(sample))
+
+    def _poll(self) -> None:
+        super()._poll()
+        if self.link == "lost":
+            self._publish_stale()
 
     def _stop(self) -> None:
         """A sensor does not move."""

@@ -18,7 +18,7 @@ from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, move_duration_
 MOVE_MARGIN_S = 0.5
 _RECENT_AT_REST_S = 0.1
 _RECENT_IN_MOTION_S = 0.03
-"""How old a pose may be that a move is said to start from; at full speed the stage gets well less far than it brakes."""
+"""How old a pose may be that a move is said to start from: at full speed a stage gets less far than it brakes."""
 _SLOWEST_UM_S = 1e-3
 
 PoseT = TypeVar("PoseT", bound=PoseSample)

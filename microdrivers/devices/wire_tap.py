@@ -16,14 +16,19 @@ class WireTap:
         self._topic = bus.topic(f"{device}/wire", WireTraffic)
         self._seq = 0
 
+    @property
+    def heard(self) -> bool:
+        """Whether anybody listens."""
+        return self._topic.heard
+
     def sent(self, t_ns: int, data: bytes) -> None:
         """The driver has handed these bytes to the port."""
-        if self._topic.heard:
+        if self.heard:
             self._publish(t_ns, "sent", data)
 
     def received(self, t_ns: int, data: bytes) -> None:
         """The driver has got these bytes from the port."""
-        if self._topic.heard:
+        if self.heard:
             self._publish(t_ns, "received", data)
 
     def _publish(self, t_ns: int, direction: Literal["sent", "received"], data: bytes) -> None:

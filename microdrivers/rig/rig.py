@@ -10,10 +10,11 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from microdrivers.core.bus import Bus
-from microdrivers.core.clock import Clock, SystemClock
+from microdrivers.core.clock import Clock, SimulatedClock, SystemClock
 from microdrivers.core.clock.interruption import INTERRUPTION
-from microdrivers.core.errors import ConnectError, ErrorTree, MicrodriversError, UnsupportedError
+from microdrivers.core.errors import ConfigError, ConnectError, ErrorTree, MicrodriversError, UnsupportedError
 from microdrivers.devices.base import Device
+from microdrivers.recording.wire_log import WireLogWriter, describe_source
 from microdrivers.rig.rig_file import RigDescription, RigFile, load_rig_file
 from microdrivers.rig.simulation import Simulation
 
@@ -36,9 +37,12 @@ class Rig:
         self.bus = bus
         self.simulation = simulation
         self.devices: dict[str, Device[Any]] = {}
+        self._wire_logs: list[WireLogWriter] = []
         for name, entry in description.devices.items():
-            settings = entry.settings if simulation is None else simulation.settings_of(name)
-            self.devices[name] = entry.driver.create(name, settings, clock, bus)
+            if simulation is None:
+                self.devices[name] = entry.driver.create(name, entry.settings, clock, bus)
+            elif name in simulation.emulations:
+                self.devices[name] = entry.driver.create(name, simulation.settings_of(name), clock, bus)
 
     @property
     def file(self) -> RigFile:
@@ -47,8 +51,25 @@ class Rig:
 
     @property
     def fake(self) -> bool:
-        """Whether the devices are emulated."""
+        """Whether the devices are emulated, or replayed from a wire log: nothing real moves."""
         return self.simulation is not None
+
+    @property
+    def starts_anew(self) -> bool:
+        """Whether the devices are as after power-on: emulators are; hardware, and a replay of its log, need not be."""
+        return self.simulation is not None and self.simulation.starts_anew
+
+    def log_wires(self, file: Path) -> None:
+        """Write what passes on all wires from now on to a new file, until the rig is closed.
+
+        Raises:
+            ConfigError: the file exists, or cannot be made.
+        """
+        seed = self.simulation.seed if self.simulation is not None else None
+        header = describe_source(self.description.as_data(), source="fake" if self.starts_anew else "live", seed=seed)
+        self._wire_logs.append(
+            WireLogWriter(file, header, bus=self.bus, devices=self.devices, start_ns=self.clock.now_ns())
+        )
 
     def device(self, name: str, kind: type[DeviceT]) -> DeviceT:
         """The device of that name, typed.
@@ -110,6 +131,8 @@ class Rig:
         if self.simulation is not None:
             self.simulation.close()
         self.clock.close()
+        for log in self._wire_logs:
+            log.close()
 
     def __enter__(self) -> Rig:
         INTERRUPTION.rig_opened()
@@ -131,14 +154,33 @@ class Rig:
 
 
 def build_rig(
-    file: Path, *, fake: bool = False, seed: int = 0, clock: Clock | None = None, world: Path | None = None
+    file: Path,
+    *,
+    fake: bool = False,
+    seed: int = 0,
+    clock: Clock | None = None,
+    world: Path | None = None,
+    wire_log: Path | None = None,
+    wire_replay: Path | None = None,
 ) -> Rig:
     """Read a rig file and build its devices, closed. See `open_rig`."""
+    if wire_replay is not None and (fake or world is not None):
+        raise ConfigError("wire_replay takes the place of a simulation", remedy="leave out fake and world")
     description = load_rig_file(file)
-    clock = clock if clock is not None else SystemClock()
+    if clock is None:
+        clock = SystemClock() if wire_replay is None else SimulatedClock()
     bus = Bus()
-    simulation = Simulation(description, clock=clock, bus=bus, seed=seed, world_file=world) if fake else None
-    return Rig(description, clock=clock, bus=bus, simulation=simulation)
+    simulation = None
+    if fake or wire_replay is not None:
+        simulation = Simulation(description, clock=clock, bus=bus, seed=seed, world_file=world, wire_log=wire_replay)
+    rig = Rig(description, clock=clock, bus=bus, simulation=simulation)
+    if wire_log is not None:
+        try:
+            rig.log_wires(wire_log)
+        except ConfigError:
+            rig.close()
+            raise
+    return rig
 
 
 @contextmanager
@@ -149,6 +191,8 @@ def open_rig(
     seed: int = 0,
     clock: Clock | None = None,
     world: Path | None = None,
+    wire_log: Path | str | None = None,
+    wire_replay: Path | str | None = None,
 ) -> Iterator[Rig]:
     """Open a rig; a context manager.
 
@@ -158,9 +202,13 @@ def open_rig(
         seed: which simulated world to draw.
         clock: default is real time; give a `SimulatedClock` to let an emulated rig run as fast as the processor.
         world: a world file for the simulation.
+        wire_log: a new file to which everything is written that passes on serial lines. Frames are not.
+        wire_replay: a wire log that answers in place of the devices, on a simulated clock unless another one is
+            given. Devices that it does not know, cameras for instance, are left out of the rig.
 
     Raises:
         ConfigError: the file is wrong. ConnectError: devices could not be opened, all failures at once.
     """
-    with build_rig(Path(file), fake=fake, seed=seed, clock=clock, world=world) as rig:
+    log, replay = (Path(name) if name is not None else None for name in (wire_log, wire_replay))
+    with build_rig(Path(file), fake=fake, seed=seed, clock=clock, world=world, wire_log=log, wire_replay=replay) as rig:
         yield rig

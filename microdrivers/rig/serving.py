@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +14,8 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SystemClock
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.devices.drivers import Endpoint, ServeRequest
+from microdrivers.devices.wire_tap import WireTap
+from microdrivers.recording.wire_log import WireLogWriter, describe_source
 from microdrivers.rig.rig_file import RigDescription
 from microdrivers.rig.simulation import Simulation, merge_settings
 
@@ -20,8 +23,11 @@ from microdrivers.rig.simulation import Simulation, merge_settings
 class ServedRig:
     """The emulators of a rig in real time, each on an endpoint. Close it to end them all.
 
+    With `wire_log`, what passes on serial lines is written to that new file as their emulators see it.
+
     Raises:
         UnsupportedError: a driver has no emulator, or one that cannot be served; all such devices are named.
+        ConfigError: the wire log exists, or cannot be made.
     """
 
     def __init__(
@@ -32,10 +38,13 @@ class ServedRig:
         world: Path | None = None,
         transport: Literal["pty", "tcp"] = "pty",
         bind: str = "127.0.0.1",
+        wire_log: Path | None = None,
     ) -> None:
         self.clock = SystemClock()
         self.description = description
-        self.simulation = Simulation(description, clock=self.clock, bus=Bus(), seed=seed, world_file=world)
+        bus = Bus()
+        self.simulation = Simulation(description, clock=self.clock, bus=bus, seed=seed, world_file=world)
+        self._wire_log: WireLogWriter | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="microdrivers-")
         request = ServeRequest(transport=transport, bind=bind, folder=Path(self._folder.name))
         self.endpoints: dict[str, Endpoint] = {}
@@ -46,9 +55,14 @@ class ServedRig:
                     f"the emulator of {', '.join(mute)} cannot be served",
                     remedy="remove the device from the rig file that you serve",
                 )
+            if wire_log is not None:
+                header = describe_source(description.as_data(), source="served", seed=seed)
+                self._wire_log = WireLogWriter(
+                    wire_log, header, bus=bus, devices=description.devices, start_ns=self.clock.now_ns()
+                )
             for name, emulation in self.simulation.emulations.items():
                 assert emulation.serve is not None
-                self.endpoints[name] = emulation.serve(request)
+                self.endpoints[name] = emulation.serve(replace(request, tap=WireTap(name, bus)))
         except BaseException:
             self.close()
             raise
@@ -74,6 +88,8 @@ class ServedRig:
         self.endpoints.clear()
         self.simulation.close()
         self.clock.close()
+        if self._wire_log is not None:
+            self._wire_log.close()
         self._folder.cleanup()
 
     def __enter__(self) -> ServedRig:

@@ -19,23 +19,27 @@ from microdrivers.devices.drivers import (
     World,
     WorldRequest,
     WorldType,
+    WorldWithEmulators,
 )
 from microdrivers.rig.registry import find_emulator, find_world
 from microdrivers.rig.rig_file import RigDescription
 from microdrivers.rig.yaml_file import Document, raise_all, read_document, validate
 
 DEFAULT_WORLD = "microscope"
+REPLAY_WORLD = "wire-log"
+_DEFAULT_FILE = Path("default world")
 
 
 class Simulation:
     """The world and the emulators behind a rig.
 
     The world file is the one given, or `worlds/<rig file's name>` beside the rig file if it exists, or the default
-    world's defaults.
+    world's defaults. With `wire_log` the world is what that wire log tells, and the log answers in place of the
+    emulators.
 
     Raises:
         UnsupportedError: a driver has no emulator; all such devices are named.
-        ConfigError: the world file is wrong.
+        ConfigError: the world file or the wire log is wrong.
     """
 
     def __init__(
@@ -46,12 +50,15 @@ class Simulation:
         bus: Bus,
         seed: int,
         world_file: Path | None = None,
+        wire_log: Path | None = None,
     ) -> None:
         self._description = description
         self.seed = seed
-        emulators = self._find_emulators()
         self.world_file = world_file or _beside(description.file)
-        self.world = self._build_world(clock, bus)
+        self.world = self._build_world(_replay_of(wire_log) if wire_log is not None else self._read_world(), clock, bus)
+        own = self.world if isinstance(self.world, WorldWithEmulators) else None
+        self.starts_anew = own.starts_anew if own is not None else True
+        emulators = own.emulators if own is not None else self._find_emulators()
         self.emulations: dict[str, Emulation] = {}
         seeds = np.random.SeedSequence(seed).generate_state(len(emulators))
         for (name, emulator), own_seed in zip(emulators.items(), seeds, strict=True):
@@ -91,10 +98,10 @@ class Simulation:
             )
         return found
 
-    def _build_world(self, clock: Clock, bus: Bus) -> World:
-        document = Document(Path("default world"), {}, {})
-        if self.world_file is not None:
-            document = read_document(self.world_file)
+    def _read_world(self) -> Document:
+        return read_document(self.world_file) if self.world_file is not None else Document(_DEFAULT_FILE, {}, {})
+
+    def _build_world(self, document: Document, clock: Clock, bus: Bus) -> World:
         name = document.data.get("world", DEFAULT_WORLD) if isinstance(document.data, dict) else DEFAULT_WORLD
         world_type: WorldType[Any] | None = find_world(str(name))
         if world_type is None:
@@ -104,6 +111,10 @@ class Simulation:
         return world_type.build(
             WorldRequest(settings=settings, rig=self._description.as_data(), seed=self.seed, clock=clock, bus=bus)
         )
+
+
+def _replay_of(wire_log: Path) -> Document:
+    return Document(wire_log, {"world": REPLAY_WORLD, "log": str(wire_log)}, {})
 
 
 def _beside(rig_file: Path) -> Path | None:

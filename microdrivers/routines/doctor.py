@@ -89,7 +89,7 @@ def _examine(rig: Rig, device: Device[Any], found: DeviceDiagnosis, motion: bool
     last = _check_round_trip(device, found)
     if last is None:
         return
-    if motion and rig.fake and isinstance(device, XYThetaStage) and unreferenced_axes(device):
+    if motion and rig.starts_anew and isinstance(device, XYThetaStage) and unreferenced_axes(device):
         device.reference(unreferenced_axes(device))
         last = device.read()
     _check_state(rig, device, last, found)
