@@ -6,7 +6,6 @@ The device is scripted at OpenCV's door: a container has none.
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2

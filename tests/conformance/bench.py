@@ -43,8 +43,9 @@ class StageBench(Bench):
     """A stage, and what is true of it.
 
     `truth(axis, t_ns)` is where the table is, µm or degrees, by another way than the driver: the emulator's own axis, a
-    gauge. `noise_um` bounds encoder noise and quantisation. `pose_rate_hz` is what the device's line can carry. `power_cycle()` switches the controller off and on. While
-    the context `silence()` is open the device hears and does not answer.
+    gauge. `noise_um` bounds encoder noise and quantisation. `pose_rate_hz` is what the device's line can carry.
+    `power_cycle()` switches the controller off and on. While the context `silence()` is open the device hears and does
+    not answer.
     """
 
     stage: XYThetaStage
