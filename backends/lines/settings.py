@@ -1,4 +1,4 @@
-"""Serial port settings, as they stand in a rig file."""
+"""Settings of serial ports and CAN buses, as they stand in a rig file."""
 
 from __future__ import annotations
 
@@ -26,3 +26,20 @@ class SerialConnection(DeviceSettings):
     def bits_per_byte(self) -> int:
         """Start, data, parity and stop bits of one byte on the line."""
         return 9 + self.stopbits + (self.parity != "N")
+
+
+class CanConnection(DeviceSettings):
+    """A CAN bus. Devices of a rig with the same interface and channel share it.
+
+    `interface` and `channel` are python-can's (socketcan and can0, slcan and /dev/ttyACM0 …), and so are the `options`
+    (fd, tty_baudrate …). A SocketCAN interface has its bit rate from the operating system; `bitrate` must say the same.
+    `timeout_s` is how long a device may take to answer. `arrival_uncertainty_ms` is how late a frame may be handed over
+    by an interface that does not stamp it; FTDI chips hold it back for up to 16 ms unless their latency timer is set.
+    """
+
+    interface: str = pydantic.Field(min_length=1)
+    channel: str = pydantic.Field(min_length=1)
+    bitrate: Literal[10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] = 500_000
+    timeout_s: float = pydantic.Field(default=0.3, gt=0, le=30)
+    arrival_uncertainty_ms: float = pydantic.Field(default=1.0, gt=0, le=100)
+    options: dict[str, bool | int | float | str] = pydantic.Field(default_factory=dict)

@@ -107,6 +107,7 @@ class EstimatorHost:
         self._consumer = consumer
         self._publish = publish
         self._failure: Exception | None = None
+        self._at_work = threading.RLock()  # one at a time: who closes must not overtake a slow estimator's thread
         arrived = self._arrived_inline if clock.simulated else self.inbox.put
         for sample in history:
             self._arrived_inline(sample)
@@ -120,17 +121,18 @@ class EstimatorHost:
         self._work(wait=True)
 
     def _work(self, *, wait: bool = False) -> None:
-        while (sample := self.inbox.take(wait=wait)) is not None:
-            if self._keep_samples:
-                self.recorded.append(sample)
-            try:
-                estimates = self._consumer.update(sample)
-            except Exception as error:
-                self._failure = error
-                self.inbox.close()  # nobody consumes any more: no publisher may wait for room
-                raise
-            for estimate in estimates:
-                self._publish(estimate)
+        with self._at_work:
+            while (sample := self.inbox.take(wait=wait)) is not None:
+                if self._keep_samples:
+                    self.recorded.append(sample)
+                try:
+                    estimates = self._consumer.update(sample)
+                except Exception as error:
+                    self._failure = error
+                    self.inbox.close()  # nobody consumes any more: no publisher may wait for room
+                    raise
+                for estimate in estimates:
+                    self._publish(estimate)
 
     def close(self) -> None:
         """Consume what is left and stop listening.

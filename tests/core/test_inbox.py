@@ -92,6 +92,30 @@ def test_a_threaded_run_replays_in_its_recorded_order_to_the_same_bits():
     assert again == [estimate.reason for estimate in live]
 
 
+def test_closing_does_not_overtake_an_estimator_that_is_far_behind(monkeypatch):
+    """The clock waits for its threads for a while only; the rest must still be consumed in order, one by one."""
+    monkeypatch.setattr("microdrivers.core.clock.system._JOIN_S", 0.02)
+    clock = SystemClock()
+    busy, seen = threading.Lock(), []
+
+    class Slow:
+        def update(self, sample):
+            assert busy.acquire(blocking=False)
+            clock.sleep(0.01)
+            seen.append(sample.seq)
+            busy.release()
+            return []
+
+    topic = Bus().topic("a", DeviceEvent)
+    host = EstimatorHost(clock, Slow(), [topic], lambda estimate: None, keep_samples=True)
+    for seq in range(10):
+        topic.publish(event(seq))
+    host.close()
+    assert seen == list(range(10))
+    assert [sample.order for sample in host.recorded] == host.inbox.arrivals
+    clock.close()
+
+
 def test_a_failing_estimator_in_a_thread_is_not_silent():
     class Broken:
         def update(self, sample):

@@ -74,6 +74,11 @@ class Clock(ABC):
     def transaction(self) -> AbstractContextManager[None]:
         """Mark a request/reply exchange; may be nested."""
 
+    @property
+    def in_transaction(self) -> bool:
+        """Whether time belongs to an exchange alone, so that waiting dispatches nothing else; never in real time."""
+        return False
+
     @abstractmethod
     def event(self) -> ClockEvent:
         """A new flag, down."""

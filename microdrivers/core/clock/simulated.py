@@ -95,6 +95,10 @@ class SimulatedClock(Clock):
                 end_ns, self._local_ns = self._local_ns, None
                 self._dispatch_until(end_ns)
 
+    @property
+    def in_transaction(self) -> bool:
+        return self._transactions > 0
+
     def event(self) -> ClockEvent:
         return _SimulatedEvent(self)
 

@@ -15,6 +15,7 @@ from microdrivers.core.units import NS_PER_S, seconds_to_ns
 _log = logging.getLogger(__name__)
 
 _JOIN_S = 5.0
+_NO_TRANSACTION = nullcontext()
 
 
 class SystemClock(Clock):
@@ -58,7 +59,7 @@ class SystemClock(Clock):
         call()
 
     def transaction(self) -> AbstractContextManager[None]:
-        return nullcontext()
+        return _NO_TRANSACTION
 
     def event(self) -> ClockEvent:
         return _SystemEvent()
