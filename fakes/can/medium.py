@@ -1,0 +1,238 @@
+"""One emulated CAN bus on a clock: nodes on one side, hosts' ports on the other."""
+
+from __future__ import annotations
+
+import errno
+import random
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from microdrivers.core.clock import Clock
+from microdrivers.core.errors import OutOfRange
+from microdrivers.core.units import seconds_to_ns
+from microdrivers.fakes.can.frame import Frame
+from microdrivers.fakes.can.pacing import Pacer, RealTimePacer, SimulatedPacer
+from microdrivers.fakes.can.port import PROTOCOL_ERROR, Arrival, Port, PortError
+from microdrivers.fakes.can.timeline import BusTimeline, CanNode
+
+LOG_LENGTH = 20_000
+"""Frames that a medium keeps: the newest."""
+
+BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+"""Bit rates of CiA 301, and 100 kbit/s."""
+
+
+class Temper(NamedTuple):
+    """How impolite hosts' ports are: a frame can be read up to `max_delay_s` after it has arrived.
+
+    On a simulated clock only; an operating system brings its own delays.
+    """
+
+    max_delay_s: float = 0.00005
+
+
+class Medium:
+    """An emulated bus; see `BusTimeline` for the rules by which frames pass.
+
+    On a simulated clock nothing happens by itself outside the clock's calls; on a real one a thread turns the medium,
+    and everything here may be called from any thread. Close it at the end.
+
+    Args:
+        name: what python-can calls its channel.
+        bitrate: bit/s.
+        seed: of the ports' delays.
+
+    Attributes:
+        log: what passed, as (end of the frame in ns, who sent it, frame); the newest `LOG_LENGTH`. An error frame is
+            logged as `PROTOCOL_ERROR` by "error". Take `list(log)` while the medium is in use.
+        error_frames: error frames so far.
+    """
+
+    def __init__(self, name: str, *, clock: Clock, bitrate: int, seed: int, temper: Temper | None = None) -> None:
+        if bitrate not in BITRATES:
+            raise OutOfRange(
+                f"{name}: a CAN bus cannot be set to {bitrate} bit/s",
+                remedy=f"use one of {', '.join(map(str, BITRATES))} bit/s",
+            )
+        self.name = name
+        self.clock = clock
+        self.bitrate = bitrate
+        self.seed = seed
+        self.lock = threading.RLock()
+        self.log: deque[tuple[int, Literal["host", "node", "error"], Frame]] = deque(maxlen=LOG_LENGTH)
+        self.error_frames = 0
+        self.plugged = True
+        self._timeline = BusTimeline(bitrate=bitrate, on_passed=self._deliver)
+        self._ports: list[Port] = []
+        self._busy: deque[tuple[int, int]] = deque(maxlen=LOG_LENGTH)
+        self._random = random.Random(seed)
+        self._max_delay_ns = seconds_to_ns((temper or Temper()).max_delay_s) if clock.simulated else 0
+        self._pacer: Pacer = SimulatedPacer(clock, self.turn)
+        if not clock.simulated:
+            self._pacer = RealTimePacer(clock, self.turn, lock=self.lock, name=name)
+
+    # ------------------------------------------------------------------ who is there
+
+    def attach(self, node: CanNode) -> None:
+        """Switch a node on, now: it is advanced to the present and may send its boot-up."""
+        with self.lock:
+            self._timeline.play(self.clock.now_ns())
+            self._timeline.attach(node, self.clock.now_ns())
+            self._plan()
+
+    def detach(self, node: CanNode) -> None:
+        """Switch a node off, now; a frame that it is sending is gone."""
+        with self.lock:
+            self._timeline.play(self.clock.now_ns())
+            self._timeline.detach(node, self.clock.now_ns())
+            self._plan()
+
+    def refresh(self) -> None:
+        """Ask the nodes for their next events again: one has been changed other than over the bus."""
+        with self.lock:
+            self._timeline.play(self.clock.now_ns())
+            self._timeline.ask_nodes()
+            self._plan()
+
+    def open_port(self, *, bitrate: int | None = None, receive_own: bool = False) -> Port:
+        """A host's controller on the bus, at the medium's bit rate if none is given.
+
+        Raises:
+            PortError: the host's side is unplugged.
+        """
+        with self.lock:
+            if not self.plugged:
+                raise _unplugged(self.name)
+            port = Port(self, bitrate=bitrate or self.bitrate, receive_own=receive_own)
+            self._ports.append(port)
+            return port
+
+    # ------------------------------------------------------------------ what can go wrong
+
+    def unplug(self) -> None:
+        """Pull the hosts' cable: all ports fail until they are opened anew; the nodes stay among themselves."""
+        with self.lock:
+            self._timeline.play(self.clock.now_ns())
+            self.plugged = False
+            for port in tuple(self._ports):
+                port.fail(_unplugged(self.name))
+
+    def plug_in(self) -> None:
+        """Put the cable back; hosts have to open their ports again."""
+        with self.lock:
+            self.plugged = True
+
+    def bus_off(self) -> None:
+        """All ports take themselves off the bus, as after 32 destroyed frames; open them anew."""
+        with self.lock:
+            self._timeline.play(self.clock.now_ns())
+            for port in tuple(self._ports):
+                port.bus_off()
+
+    def inject_error_frame(self) -> None:
+        """Disturb the bus now; a frame that is destroyed is sent again."""
+        with self.lock:
+            self._timeline.play(self.clock.now_ns())
+            sender = self._timeline.disturb(self.clock.now_ns())
+            if isinstance(sender, Port):
+                sender.destroyed(again=False)
+            self._plan()
+
+    # ------------------------------------------------------------------ time
+
+    def turn(self, t_ns: int | None = None) -> int:
+        """Let happen what is due by `t_ns`, or by now; returns when something happens next, `NEVER_NS` if nothing."""
+        with self.lock:
+            due_ns = self._timeline.play(self.clock.now_ns() if t_ns is None else t_ns)
+            self._pacer.plan(due_ns)
+            return due_ns
+
+    def turn_until(self, reached: Callable[[], bool], deadline_ns: int) -> int:
+        """Let happen what is due until `reached()`, or by `deadline_ns`; returns when something has happened last."""
+        with self.lock:
+            self._pacer.plan(self._timeline.play(deadline_ns, reached=reached))
+            return self._timeline.last_event_ns
+
+    def next_event_ns(self) -> int:
+        """When something happens next on the bus; `NEVER_NS` if all is quiet."""
+        with self.lock:
+            return self._timeline.next_event_ns()
+
+    def load(self, window_s: float = 1.0) -> float:
+        """Share of the last `window_s` in which the bus was not free, 0 to 1; interframe spaces count as taken.
+
+        At most the newest `LOG_LENGTH` frames are looked at.
+        """
+        with self.lock:
+            end_ns = self.clock.now_ns()
+            begin_ns = end_ns - seconds_to_ns(window_s)
+            self.turn(end_ns)
+            busy_ns = 0
+            for start_ns, free_ns in reversed(self._busy):
+                if free_ns <= begin_ns:
+                    break
+                busy_ns += max(0, min(free_ns, end_ns) - max(start_ns, begin_ns))
+            return busy_ns / (end_ns - begin_ns)
+
+    def close(self) -> None:
+        """End the medium and its ports; idempotent."""
+        for port in tuple(self._ports):
+            port.close()
+        self._pacer.close()
+
+    # ------------------------------------------------------------------ for ports
+
+    def offer(self, port: Port, frame: Frame, t_ns: int) -> None:
+        """A port's oldest frame competes from `t_ns` on."""
+        self._timeline.offer(port, frame, t_ns, readable=port.readable)
+
+    def settle(self) -> None:
+        """A port has offered a frame."""
+        if self.clock.simulated:
+            self._plan()  # it starts when all who offer one at this instant have done so
+        else:
+            self.turn()
+
+    def forget(self, port: Port) -> None:
+        """A port leaves, and its frames with it."""
+        if port in self._ports:
+            self._ports.remove(port)
+        self._timeline.withdraw(port, self.clock.now_ns())
+        self._plan()
+
+    def _plan(self) -> None:
+        self._pacer.plan(self._timeline.next_event_ns())
+
+    def _deliver(self, sender: object, frame: Frame, start_ns: int, end_ns: int, intact: bool) -> None:
+        self._busy.append((start_ns, end_ns + self._timeline.interframe_ns))
+        if intact:
+            self.log.append((end_ns, "host" if isinstance(sender, Port) else "node", frame))
+        else:
+            self.log.append((end_ns, "error", PROTOCOL_ERROR))
+            self.error_frames += 1
+        ready_ns = end_ns
+        if self._max_delay_ns:
+            ready_ns += round(self._random.random() * self._max_delay_ns)
+        for port in self._ports:
+            if port is sender and intact:
+                if port.receive_own:
+                    port.take(Arrival(end_ns, frame, own=True), start_ns, ready_ns)
+            elif intact and port.readable:
+                port.take(Arrival(end_ns, frame), start_ns, ready_ns)
+            else:
+                port.take(Arrival(end_ns, PROTOCOL_ERROR, error=True), start_ns, ready_ns)
+        if isinstance(sender, Port):
+            if intact:
+                sender.sent()
+            else:
+                sender.destroyed(again=True)
+
+
+def _unplugged(name: str) -> PortError:
+    return PortError(
+        f"the emulated CAN cable of {name} is unplugged",
+        number=errno.ENODEV,
+        remedy="plug it in and open the bus again",
+    )
