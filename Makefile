@@ -47,13 +47,14 @@ format: $(READY)
 # Needs uv (pip install uv); the lock names no index.
 lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header \
-	  --no-annotate --upgrade --extra can --group dev pyproject.toml -o requirements.lock
+	  --no-annotate --upgrade --group dev pyproject.toml -o requirements.lock
 
 bench: $(READY)
 	$(BIN)/python scripts/bench_rls.py
 	$(BIN)/python scripts/bench_bus.py
 	$(BIN)/python scripts/bench_tracker.py
 	$(BIN)/python scripts/bench_worlds.py
+	$(BIN)/python scripts/bench_wires.py
 
 clean:
 	rm -rf $(VENV) dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -23,15 +23,16 @@ class CameraDeviceSettings(DeviceSettings):
     | `images:///folder/img_%04d.png` | numbered images of a folder, played at `rate_hz` |
     | `video:///path/film.avi` | a film, played at `rate_hz` |
 
-    `sensor_size_px` is width, height; `principal_point_px` is
-    where the optical axis meets the sensor, full-sensor pixels from the centre of the top-left pixel (default: the
-    middle). `arrival_delay_ms` ± `arrival_uncertainty_ms` (95 %) say how long after mid-exposure a frame arrives;
-    they are used only for sources that cannot tell the time of capture.
+    `view` says whether it looks down on the stage's plane or along it. `sensor_size_px` is width, height;
+    `principal_point_px` is where the optical axis meets the sensor, full-sensor pixels from the centre of the top-left
+    pixel (default: the middle). `arrival_delay_ms` ± `arrival_uncertainty_ms` (95 %) say how long after mid-exposure a
+    frame arrives; they are used only for sources that cannot tell the time of capture.
     """
 
     driver: Literal["camera"] = "camera"
     source: str = pydantic.Field(pattern=r"^[a-z0-9+]+://")
     sensor_size_px: tuple[_Pixels, _Pixels]
+    view: Literal["top", "lateral"] = "top"
     pixel_pitch_um: float = pydantic.Field(gt=0, le=100)
     principal_point_px: tuple[float, float] | None = None
     rate_hz: float = pydantic.Field(default=30.0, gt=0, le=10_000)

@@ -81,6 +81,7 @@ class FakeFrameSource:
         self.serial_number = f"SIM-{name}"
         self.connected = True
         self._world = world
+        self._view = world.view(name)
         self._principal_point_px = principal_point_px
         self._random = np.random.default_rng(seed)
         self._settings: CameraSettings | None = None
@@ -103,7 +104,7 @@ class FakeFrameSource:
         exposure_ms = round(wanted.exposure_ms, 2)
         self._settings = msgspec.structs.replace(wanted, exposure_ms=exposure_ms)
         _, _, width, height = wanted.roi
-        self._renderer = Renderer(width, height, self._world.look)
+        self._renderer = Renderer(width, height, self._view.look)
         return self._settings
 
     def start(self, sink: FrameSink, lost: LossHandler) -> None:
@@ -154,11 +155,11 @@ class FakeFrameSource:
             return
         left, top, _, _ = settings.roi
         pu, pv = self._principal_point_px
-        image = self._world.render(
+        image = self._view.render(
             middle_ns, exposure_ns=exposure_ns, renderer=renderer, principal_point_px=(pu - left, pv - top),
             frame_id=frame_id,
         )  # fmt: skip
-        self._world.publish_truth(middle_ns, frame_id)
+        self._view.publish_truth(middle_ns, frame_id)
         times = self._world.settings.camera
         stamp_ns = middle_ns + seconds_to_ns(
             self._world.stamp_error_s + self._random.normal(0.0, times.stamp_jitter_ms / 1000.0)

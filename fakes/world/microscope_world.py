@@ -19,14 +19,16 @@ from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.drivers import WorldRequest
 from microdrivers.fakes.world.axis import Axis
 from microdrivers.fakes.world.optics import Microscope
-from microdrivers.fakes.world.scene import Image, Look, Renderer, Speck
+from microdrivers.fakes.world.scene import Look, Speck
 from microdrivers.fakes.world.settings import WorldSettings
+from microdrivers.fakes.world.tools import Tools
+from microdrivers.fakes.world.views import View, coarse_view, lateral_view
 
 Array = npt.NDArray[np.float64]
 
 
 class MicroscopeWorld:
-    """What the emulators share; they move `stage_axes` and `zoom_axis` and look through `render`."""
+    """What the emulators share; they move `stage_axes`, `zoom_axis` and `fine_stage_axes` and look through `view`."""
 
     def __init__(self, request: WorldRequest[WorldSettings]) -> None:
         self.settings = request.settings
@@ -40,6 +42,11 @@ class MicroscopeWorld:
         self._draw_optics(random)
         self._draw_target(random)
         self._draw_times(random)
+        tools = Tools(request.rig.get("devices", {}), request.settings.tools, seed=request.seed)
+        self.fine_stage_axes = tools.axes
+        self.fine_stage_home_um = tools.home_um
+        self.fine_stage_power_on_offset_um = tools.power_on_offset_um
+        self.force_uN = tools.force_uN
 
     def close(self) -> None:
         """A world holds nothing that must be released."""
@@ -59,27 +66,19 @@ class MicroscopeWorld:
             self._on_stage(self._corners_um, t_ns), zoom=self.zoom_at(t_ns), time_s=self._s(t_ns)
         )
 
-    def render(
-        self,
-        t_ns: int,
-        *,
-        exposure_ns: int,
-        renderer: Renderer,
-        principal_point_px: tuple[float, float],
-        frame_id: int,
-    ) -> Image:
-        """The image of an exposure centred at `t_ns`."""
-        origin = np.asarray(principal_point_px)
+    def _visible_corners_px(self, t_ns: int) -> Array:
         corners = self.corners_px(t_ns)
-        travel = self.corners_px(t_ns + exposure_ns // 2) - self.corners_px(t_ns - exposure_ns // 2)
-        if not self.settings.target.visible:
-            corners = corners + 1e6
-        return renderer.render(
-            corners + origin,
-            travel,
-            self._blobs_px(t_ns, origin),
-            random=np.random.default_rng((self.seed, 7, frame_id)),
-        )
+        return corners if self.settings.target.visible else corners + 1e6
+
+    def view(self, camera: str) -> View:
+        """What a camera of the rig file sees: the microscope's own, one from the side, or any other from above."""
+        section = self._rig.get("devices", {}).get(camera, {})
+        if camera == (self._rig.get("microscope") or {}).get("camera", camera):
+            return View(self.look, self._visible_corners_px, (self.seed, 7), self._blobs_px, self.publish_truth)
+        if section.get("view") == "lateral":
+            return lateral_view(camera, self.look, self.fine_stage_axes, seed=self.seed)
+        on_stage = lambda t_ns: self._on_stage(self._corners_um, t_ns)  # noqa: E731
+        return coarse_view(camera, self.microscope, self.look, on_stage, seed=self.seed, s=self._s)
 
     def publish_truth(self, t_ns: int, frame_seq: int) -> None:
         """Put the truth of a frame on the bus, for the report and tests."""

@@ -78,8 +78,31 @@ class TargetWorld(DeviceSettings):
     visible: bool = True
 
 
+class ToolsWorld(DeviceSettings):
+    """The fine stages' mechanics, and the one thing that tools can touch.
+
+    The obstacle's surface lies `obstacle_um` below the middle of a tool's travel, z = −obstacle_um of its stage.
+    """
+
+    servo_lag_ms: float = pydantic.Field(default=2.0, gt=0)
+    encoder_noise_um: float = pydantic.Field(default=0.010, ge=0)
+    obstacle_um: float = 200.0
+    obstacle_stiffness_uN_per_um: float = pydantic.Field(default=50.0, gt=0)
+
+
+class ForceWorld(DeviceSettings):
+    """The force sensors' imperfections: white noise by device, drift, and the zero that they were switched on with."""
+
+    noise_uN_per_sqrt_Hz: dict[str, float] = pydantic.Field(
+        default_factory=lambda: {"probe_force": 0.002, "gripper_force": 0.07}
+    )
+    default_noise_uN_per_sqrt_Hz: float = pydantic.Field(default=0.07, ge=0)
+    drift_uN_per_min: float = pydantic.Field(default=0.1, ge=0)
+    zero_spread_uN: float = pydantic.Field(default=5.0, ge=0)
+
+
 class WorldSettings(DeviceSettings):
-    """A microscope that looks at a square on an XYθ stage."""
+    """A microscope that looks at a square on an XYθ stage, and tools on fine stages beside it."""
 
     schema_version: Literal[1] = 1
     world: Literal["microscope"] = "microscope"
@@ -88,3 +111,5 @@ class WorldSettings(DeviceSettings):
     optics: OpticsWorld = OpticsWorld()
     camera: CameraWorld = CameraWorld()
     target: TargetWorld = TargetWorld()
+    tools: ToolsWorld = ToolsWorld()
+    force: ForceWorld = ForceWorld()

@@ -112,7 +112,9 @@ def _on_rig(
 
     file, fake, seed, world, wire_log, _ = choice
     clock = SimulatedClock() if fake and not real_time else SystemClock()
-    with open_rig(file, fake=fake, seed=seed or 0, clock=clock, world=world, wire_log=wire_log) as rig:
+    with open_rig(
+        file, fake=fake, seed=seed or 0, clock=clock, world=world, devices="microscope", wire_log=wire_log
+    ) as rig:
         settings = CircleSettings(**circle)
         provenance = {
             "source": "emulated rig" if fake else "emulated rig on ports" if rig.file.emulated else "live rig",

@@ -25,7 +25,7 @@ _INDENT = " " * 11
 
 @click.command(short_help="Examine every device and say what is wrong and what to try.")
 @rig_options
-@click.option("--motion", is_flag=True, help="Also move each referenced x and y axis by ±20 µm; asks first.")
+@click.option("--motion", is_flag=True, help="Also move each referenced linear axis by ±20 µm; asks first.")
 @click.option("--yes", is_flag=True, help="Do not ask whether the way is free.")
 @click.option("--json", "as_json", is_flag=True, help="Print findings and figures as JSON.")
 def doctor(choice: RigChoice, motion: bool, yes: bool, as_json: bool) -> None:
@@ -67,12 +67,12 @@ def doctor(choice: RigChoice, motion: bool, yes: bool, as_json: bool) -> None:
 
 
 def _ask_for_the_way(rig: Rig) -> None:
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.stage import Stage
     from microdrivers.routines.doctor import STEP_UM
 
-    stages = [name for name, device in rig.devices.items() if isinstance(device, XYThetaStage)]
+    stages = [name for name, device in rig.devices.items() if isinstance(device, Stage)]
     if stages:
-        what = f"{', '.join(stages)}: x and y will move by ±{STEP_UM:g} µm. Is the way free?"
+        what = f"{', '.join(stages)}: linear axes will move by ±{STEP_UM:g} µm. Is the way free?"
         click.confirm(what, abort=True, err=True)
 
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
     from microdrivers.rig import Rig
 
-_STAGE_OPTIONS = ("x_um", "y_um", "theta_deg", "speed_um_s", "theta_speed_deg_s")
+_TARGET_OF = {"x": "x_um", "y": "y_um", "z": "z_um", "theta": "theta_deg"}
 _ZOOM_OPTIONS = ("zoom",)
 
 
@@ -23,12 +23,14 @@ _ZOOM_OPTIONS = ("zoom",)
 @click.argument("device")
 @click.option("--x-um", type=float, help="Target (with --by: distance) on x, µm.")
 @click.option("--y-um", type=float, help="Target (with --by: distance) on y, µm.")
+@click.option("--z-um", type=float, help="Target (with --by: distance) on z of a fine stage, µm.")
 @click.option("--theta-deg", type=float, help="Target (with --by: angle) on θ, degrees.")
 @click.option("--zoom", type=float, help="Zoom to set (with --by: to add).")
 @click.option("--by", "relative", is_flag=True, help="Move by these amounts, counted from where the device is.")
-@click.option("--speed-um-s", type=float, help="Path speed in the xy plane; default: as fast as the axes allow.")
+@click.option("--speed-um-s", type=float, help="Path speed of the linear axes; default: as fast as they allow.")
 @click.option("--theta-speed-deg-s", type=float, help="Speed of θ; default: as fast as the axis allows.")
-def move(choice: RigChoice, device: str, relative: bool, **options: float | None) -> None:
+@click.option("--retract", is_flag=True, help="Take a fine stage's tool away from the sample, as the rig file says.")
+def move(choice: RigChoice, device: str, relative: bool, retract: bool, **options: float | None) -> None:
     r"""Move DEVICE of the rig file RIG, wait until it has settled and print where it was observed to be.
 
     The move is checked before anything moves: finite, inside the limits, axes referenced, speed possible; nothing is
@@ -41,6 +43,8 @@ def move(choice: RigChoice, device: str, relative: bool, **options: float | None
       microdrivers move lab.yaml sample_stage --by --x-um -20
       microdrivers move lab.yaml sample_stage --theta-deg 0.5
       microdrivers move lab.yaml zoom --zoom 1.2
+      microdrivers move lab.yaml probe_stage --z-um 250 --speed-um-s 50
+      microdrivers move lab.yaml probe_stage --retract
     """
     from microdrivers.core.errors import NotReferenced
     from microdrivers.devices.zoom_motor import ZoomMotor
@@ -49,7 +53,7 @@ def move(choice: RigChoice, device: str, relative: bool, **options: float | None
     given = {name: value for name, value in options.items() if value is not None}
     with closing(choice.build()) as rig:
         stage_or_zoom = _find(rig, device)
-        _check_options(stage_or_zoom, given)
+        _check_options(stage_or_zoom, given, retract)
         stage_or_zoom.open()
         try:
             if isinstance(stage_or_zoom, ZoomMotor):
@@ -63,27 +67,33 @@ def move(choice: RigChoice, device: str, relative: bool, **options: float | None
             raise
 
 
-def _find(rig: Rig, name: str) -> XYThetaStage | ZoomMotor:
+def _find(rig: Rig, name: str) -> Stage[Any] | ZoomMotor:
     from microdrivers.core.errors import UnsupportedError
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
 
     device = rig.devices.get(name)
-    if isinstance(device, XYThetaStage | ZoomMotor):
+    if isinstance(device, Stage | ZoomMotor):
         return device
-    movable = [known for known, each in rig.devices.items() if isinstance(each, XYThetaStage | ZoomMotor)]
+    movable = [known for known, each in rig.devices.items() if isinstance(each, Stage | ZoomMotor)]
     found = "is no device of this rig" if device is None else "cannot move"
     raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(movable) or 'none: nothing can move'}")
 
 
-def _check_options(device: XYThetaStage | ZoomMotor, given: dict[str, float]) -> None:
+def _check_options(device: Stage[Any] | ZoomMotor, given: dict[str, float], retract: bool) -> None:
     """Refuse options that are not the device's, or that name no target, before anything is opened."""
     from microdrivers.core.errors import OutOfRange, UnsupportedError
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.fine_stage import FineStage
 
-    known = _STAGE_OPTIONS if isinstance(device, XYThetaStage) else _ZOOM_OPTIONS
-    foreign = [_option(name) for name in given if name not in known]
+    known = _options_of(device)
     targets = [_option(name) for name in known if "speed" not in name]
+    if retract:
+        if not isinstance(device, FineStage) or given:
+            raise UnsupportedError(
+                "--retract is a whole move of a fine stage", device=device.name, remedy="give it alone, or leave it out"
+            )
+        return
+    foreign = [_option(name) for name in given if name not in known]
     if foreign:
         raise UnsupportedError(
             f"{', '.join(foreign)} cannot be used here", device=device.name, remedy=f"give {', '.join(targets)}"
@@ -92,39 +102,58 @@ def _check_options(device: XYThetaStage | ZoomMotor, given: dict[str, float]) ->
         raise OutOfRange("a move needs a target", device=device.name, remedy=f"give {', '.join(targets)}")
 
 
+def _options_of(device: Stage[Any] | ZoomMotor) -> tuple[str, ...]:
+    from microdrivers.devices.stage import Stage
+
+    if not isinstance(device, Stage):
+        return _ZOOM_OPTIONS
+    turns = "theta" in device.axis_names
+    return (*(_TARGET_OF[axis] for axis in device.axis_names), "speed_um_s", *["theta_speed_deg_s"] * turns)
+
+
 def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
 def _axes(given: dict[str, float]) -> list[str]:
-    option_of = {"x": "x_um", "y": "y_um", "theta": "theta_deg"}
-    return [axis for axis, option in option_of.items() if option in given]
+    return [axis for axis, option in _TARGET_OF.items() if option in given]
 
 
-def _reference_emulated(rig: Rig, stage: XYThetaStage, given: dict[str, float]) -> None:
-    unknown = [axis for axis in _axes(given) if not stage.referenced[axis]]
+def _reference_emulated(rig: Rig, stage: Stage[Any], given: dict[str, float]) -> None:
+    unknown = _to_reference(stage, given)
     if rig.starts_anew and unknown:
         click.echo(f"· referencing {', '.join(unknown)} of the emulated stage first", err=True)
         stage.reference(unknown)
 
 
-def _move_stage(stage: XYThetaStage, given: dict[str, float], relative: bool) -> str:
+def _move_stage(stage: Stage[Any], given: dict[str, float], relative: bool) -> str:
     from microdrivers.routines.device_state import state_text
 
-    if relative:
-        pose = stage.move_by(**{name if "speed" in name else f"d{name}": value for name, value in given.items()})
+    moving: Any = stage  # which keywords its own move takes has been checked
+    if not given:
+        pose = moving.retract().wait()
+    elif relative:
+        pose = moving.move_by(**{name if "speed" in name else f"d{name}": value for name, value in given.items()})
     else:
-        pose = stage.move_to(**given)
+        pose = moving.move_to(**given)
     here, goal = pose.position, pose.target
-    misses = [f"{axis} {here[axis] - goal[axis]:+.3g} {stage.axes[axis].unit}" for axis in _axes(given)]
+    axes = _axes(given) or [axis for axis in here if goal[axis] == goal[axis]]
+    misses = [f"{axis} {here[axis] - goal[axis]:+.3g} {stage.axes[axis].unit}" for axis in axes]
     return f"{state_text(stage, pose)}; off target by {', '.join(misses)}"
 
 
-def _reference_command(choice: RigChoice, device: XYThetaStage | ZoomMotor, given: dict[str, float]) -> str:
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+def _reference_command(choice: RigChoice, device: Stage[Any] | ZoomMotor, given: dict[str, float]) -> str:
+    from microdrivers.devices.stage import Stage
 
     command = f"microdrivers reference {choice.file} --device {device.name}"
-    if not isinstance(device, XYThetaStage):
+    if not isinstance(device, Stage):
         return command
-    unknown = [axis for axis in _axes(given) if not device.referenced[axis]]
-    return f"{command} --axes {','.join(unknown)}"
+    return f"{command} --axes {','.join(_to_reference(device, given))}"
+
+
+def _to_reference(stage: Stage[Any], given: dict[str, float]) -> list[str]:
+    """Axes that a move needs and whose reference is not known; a fine stage is referenced as a whole, z away first."""
+    from microdrivers.devices.fine_stage import FineStage
+
+    needed = stage.axis_names if isinstance(stage, FineStage) else _axes(given)
+    return [axis for axis in stage.reference_order if axis in needed and not stage.referenced[axis]]

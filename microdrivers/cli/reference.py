@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,7 +12,7 @@ from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:
     from microdrivers.core.samples import DeviceEvent
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
     from microdrivers.rig import Rig
 
@@ -51,26 +51,25 @@ def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool
         click.echo(f"{found.name}: {what}; now at {state_text(found, found.read())}")
 
 
-def _find(rig: Rig, choice: RigChoice, name: str | None) -> XYThetaStage | ZoomMotor:
+def _find(rig: Rig, choice: RigChoice, name: str | None) -> Stage[Any] | ZoomMotor:
     from microdrivers.core.errors import ConfigError, UnsupportedError
-    from microdrivers.devices.xytheta_stage import XYThetaStage
+    from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
 
     section = rig.file.microscope
     if name is None and section is None:
         raise ConfigError("the rig file names no sample stage", file=str(choice.file), remedy="add --device NAME")
     device = rig.devices.get(name or (section.sample_stage if section else ""))
-    if isinstance(device, XYThetaStage | ZoomMotor):
+    if isinstance(device, Stage | ZoomMotor):
         return device
-    known = [other for other, each in rig.devices.items() if isinstance(each, XYThetaStage | ZoomMotor)]
+    known = [other for other, each in rig.devices.items() if isinstance(each, Stage | ZoomMotor)]
     found = "is no device of this rig" if device is None else "has no reference"
     raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(known) or 'none: nothing can move'}")
 
 
-def _checked_axes(device: XYThetaStage | ZoomMotor, axes: str | None) -> list[str]:
+def _checked_axes(device: Stage[Any] | ZoomMotor, axes: str | None) -> list[str]:
     """The axes that were named, refused before anything is opened or asked if they are not the device's."""
     from microdrivers.core.errors import OutOfRange, UnsupportedError
-    from microdrivers.devices.xytheta_stage import AXES
     from microdrivers.devices.zoom_motor import ZoomMotor
 
     names = [name.strip() for name in (axes or "").split(",") if name.strip()]
@@ -78,10 +77,11 @@ def _checked_axes(device: XYThetaStage | ZoomMotor, axes: str | None) -> list[st
         if axes is not None:
             raise UnsupportedError("a zoom has one axis only", device=device.name, remedy="leave out --axes")
         return []
-    if not names or len(set(names)) != len(names) or not set(names) <= set(AXES):
+    if not names or len(set(names)) != len(names) or not set(names) <= set(device.axis_names):
         raise OutOfRange(
             f"axes to reference: {', '.join(names) or 'none'}", device=device.name,
-            remedy=f"name each of {', '.join(AXES)} at most once, in the order that is safe: --axes {','.join(AXES)}",
+            remedy=f"name each of {', '.join(device.axis_names)} at most once, in the order that is safe: "
+            f"--axes {','.join(device.reference_order)}",
         )  # fmt: skip
     return names
 

@@ -18,6 +18,9 @@ from microdrivers.cli.rig_options import WIRE_LOG_HELP
 )
 @click.option("--bind", default="127.0.0.1", show_default=True, help="Address for TCP and HTTP; the default is local.")
 @click.option(
+    "--can", "can_interface", metavar="NAME", help="SocketCAN interface for CAN, as vcan0; default: a serial adapter."
+)
+@click.option(
     "--write", "served", type=click.Path(path_type=Path), help="Write a rig file that points at the endpoints."
 )
 @click.option(
@@ -33,6 +36,7 @@ def serve(
     rig: Path,
     transport: Literal["pty", "tcp"],
     bind: str,
+    can_interface: str | None,
     served: Path | None,
     duration_s: float | None,
     seed: int,
@@ -42,8 +46,8 @@ def serve(
 ) -> None:
     r"""Emulate the rig file RIG in real time and let other programs use it.
 
-    Serial devices appear on pseudo-terminals or TCP ports, cameras as HTTP streams. Other machines are not let in
-    unless --bind says so.
+    Serial devices appear on pseudo-terminals or TCP ports, CAN buses behind a serial adapter (slcan) or on a SocketCAN
+    interface, cameras as HTTP streams. Other machines are not let in unless --bind says so.
 
     \b
     Examples:
@@ -54,7 +58,15 @@ def serve(
     from microdrivers.rig.serving import ServedRig
 
     description = load_rig_file(rig)
-    with ServedRig(description, seed=seed, world=world, transport=transport, bind=bind, wire_log=wire_log) as running:
+    with ServedRig(
+        description,
+        seed=seed,
+        world=world,
+        transport=transport,
+        bind=bind,
+        can_interface=can_interface,
+        wire_log=wire_log,
+    ) as running:
         if served is not None:
             running.write(served)
         where = {name: endpoint.where for name, endpoint in running.endpoints.items()}

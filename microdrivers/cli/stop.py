@@ -45,9 +45,10 @@ def stop(choice: RigChoice) -> None:
       microdrivers stop lab.yaml
     """
     from microdrivers.devices.camera import Camera
+    from microdrivers.devices.force_sensor import ForceSensor
 
     with closing(choice.build()) as rig:
-        moving = [device for device in rig.devices.values() if not isinstance(device, Camera)]
+        moving = [device for device in rig.devices.values() if not isinstance(device, Camera | ForceSensor)]
         told = _tell_all(rig, moving)
         width = max(map(len, rig.devices))
         failed = False

@@ -6,13 +6,21 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Generic, Literal
 
 import msgspec
 
 from microdrivers.core.bus import Bus, Topic
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import DeviceFault, LinkError, LinkLost, MicrodriversError, StaleData
+from microdrivers.core.errors import (
+    DeviceFault,
+    LinkError,
+    LinkLost,
+    MicrodriversError,
+    ProtocolError,
+    StaleData,
+)
 from microdrivers.core.samples import DeviceEvent, EventKind, SampleT
 from microdrivers.core.units import NS_PER_S, Range, check_range
 
@@ -110,7 +118,9 @@ class Device(ABC, Generic[SampleT]):
             return
         try:
             with self._naming_errors():
-                self.info = self._identify()
+                found = self._identify()
+                self._require_same(found)
+            self.info = found
         except BaseException:
             self.link = "closed"
             self._close()
@@ -149,10 +159,13 @@ class Device(ABC, Generic[SampleT]):
         Raises:
             LinkError: no connection, no answer, or an unintelligible one.
         """
-        with self._naming_errors():
+        try:
             self._require_open()
             sample = self._read()
-        self.clock.deliver(lambda: self.topic.publish(sample))
+        except MicrodriversError as error:
+            self._put_name_on(error)
+            raise
+        self.clock.deliver(partial(self.topic.publish, sample))
         return sample
 
     def latest(self, *, max_age_s: float) -> SampleT:
@@ -204,6 +217,17 @@ class Device(ABC, Generic[SampleT]):
             )
         )  # fmt: skip
 
+    def _require_same(self, found: DeviceInfo) -> None:
+        """What comes back on the same port must be what was there before: the rig was set up for that one."""
+        known = self.info.serial_number
+        if known and found.serial_number != known:
+            raise ProtocolError(
+                f"{found.model or 'a device'} with serial number {found.serial_number or 'unknown'} answers in the "
+                f"place of {known}",
+                remedy="connect the device that was there before, or open the rig anew",
+                moved="no",
+            )
+
     def _require_open(self) -> None:
         if self.link != "open":
             raise LinkLost(
@@ -239,8 +263,11 @@ class Device(ABC, Generic[SampleT]):
         try:
             yield
         except MicrodriversError as error:
-            error.device = error.device or self.name
-            if isinstance(error, DeviceFault):
-                self.fault = error
-                self._publish_event("fault", reason=error.what)
+            self._put_name_on(error)
             raise
+
+    def _put_name_on(self, error: MicrodriversError) -> None:
+        error.device = error.device or self.name
+        if isinstance(error, DeviceFault) and error is not self.fault:  # raised again, it is not a new one
+            self.fault = error
+            self._publish_event("fault", reason=error.what)

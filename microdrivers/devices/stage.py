@@ -79,6 +79,23 @@ class Stage(Device[PoseT]):
         """Smallest commanded step of each axis, µm or degrees."""
         return {name: axis.resolution for name, axis in self.axes.items()}
 
+    @property
+    def reference_order(self) -> tuple[str, ...]:
+        """The order in which all axes are referenced where nobody names another."""
+        return self.axis_names
+
+    def start_axis_to(self, axis: str, position: float, *, speed: float) -> Move[PoseT]:
+        """Move one axis by its name, in its own unit (µm, deg) and speed (µm/s, deg/s); otherwise as `start_move_to`.
+
+        Raises:
+            OutOfRange, NotReferenced, LinkLost: before anything moves.
+        """
+        if axis not in self.axes:
+            raise OutOfRange(f"there is no axis {axis!r}", device=self.name, remedy=f"name one of {list(self.axes)}")
+        limits, unit = Range(_SLOWEST_UM_S, self.max_speed[axis]), self.axes[axis].unit
+        check_range(speed, limits, what=f"speed of axis {axis}", unit=f"{unit}/s", device=self.name)
+        return self._command({axis: position}, lambda _start, _targets: {axis: speed})
+
     def reference(self, axes: Sequence[str]) -> None:
         """Find the reference of the named axes, in exactly that order. Moves the stage to its switches.
 

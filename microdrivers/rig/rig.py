@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock, SystemClock
@@ -160,6 +160,7 @@ def build_rig(
     seed: int = 0,
     clock: Clock | None = None,
     world: Path | None = None,
+    devices: Collection[str] | Literal["microscope"] | None = None,
     wire_log: Path | None = None,
     wire_replay: Path | None = None,
 ) -> Rig:
@@ -167,6 +168,8 @@ def build_rig(
     if wire_replay is not None and (fake or world is not None):
         raise ConfigError("wire_replay takes the place of a simulation", remedy="leave out fake and world")
     description = load_rig_file(file)
+    if devices is not None:
+        description = description.restricted_to(description.microscope_devices if devices == "microscope" else devices)
     if clock is None:
         clock = SystemClock() if wire_replay is None else SimulatedClock()
     bus = Bus()
@@ -191,6 +194,7 @@ def open_rig(
     seed: int = 0,
     clock: Clock | None = None,
     world: Path | None = None,
+    devices: Collection[str] | Literal["microscope"] | None = None,
     wire_log: Path | str | None = None,
     wire_replay: Path | str | None = None,
 ) -> Iterator[Rig]:
@@ -202,6 +206,7 @@ def open_rig(
         seed: which simulated world to draw.
         clock: default is real time; give a `SimulatedClock` to let an emulated rig run as fast as the processor.
         world: a world file for the simulation.
+        devices: open these alone, or those of the microscope; default: all of the file.
         wire_log: a new file to which everything is written that passes on serial lines. Frames are not.
         wire_replay: a wire log that answers in place of the devices, on a simulated clock unless another one is
             given. Devices that it does not know, cameras for instance, are left out of the rig.
@@ -210,5 +215,15 @@ def open_rig(
         ConfigError: the file is wrong. ConnectError: devices could not be opened, all failures at once.
     """
     log, replay = (Path(name) if name is not None else None for name in (wire_log, wire_replay))
-    with build_rig(Path(file), fake=fake, seed=seed, clock=clock, world=world, wire_log=log, wire_replay=replay) as rig:
+    rig = build_rig(
+        Path(file),
+        fake=fake,
+        seed=seed,
+        clock=clock,
+        world=world,
+        devices=devices,
+        wire_log=log,
+        wire_replay=replay,
+    )
+    with rig:
         yield rig

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
 
-from microdrivers.core.errors import ConfigError
+from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.devices.drivers import DeviceSettings, Driver
 from microdrivers.rig.registry import find_driver, known_drivers
 from microdrivers.rig.yaml_file import Document, raise_all, read_document, validate
@@ -86,6 +86,26 @@ class RigDescription:
     file: Path
     rig: RigFile
     devices: Mapping[str, DeviceEntry]
+
+    def restricted_to(self, names: Collection[str]) -> RigDescription:
+        """The same rig with these devices alone.
+
+        Raises:
+            UnsupportedError: one of them is not in the file.
+        """
+        unknown = [name for name in names if name not in self.devices]
+        if unknown:
+            raise UnsupportedError(
+                f"there is no device {', '.join(unknown)} in rig {self.rig.name!r}",
+                remedy=f"name some of {', '.join(self.devices)}",
+            )
+        return replace(self, devices={name: entry for name, entry in self.devices.items() if name in names})
+
+    @property
+    def microscope_devices(self) -> tuple[str, ...]:
+        """Names of the devices that make up the microscope; all devices if the file has no such section."""
+        section = self.rig.microscope
+        return tuple(self.devices) if section is None else (section.sample_stage, section.zoom, section.camera)
 
     def as_data(self) -> dict[str, Any]:
         """The whole rig as plain data with all defaults filled in, as worlds and provenance need it."""

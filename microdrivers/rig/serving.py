@@ -23,7 +23,8 @@ from microdrivers.rig.simulation import Simulation, merge_settings
 class ServedRig:
     """The emulators of a rig in real time, each on an endpoint. Close it to end them all.
 
-    With `wire_log`, what passes on serial lines is written to that new file as their emulators see it.
+    CAN buses stand behind a serial adapter (slcan) each, or on the existing SocketCAN interface `can_interface`. With
+    `wire_log`, what passes on serial lines is written to that new file as their emulators see it.
 
     Raises:
         UnsupportedError: a driver has no emulator, or one that cannot be served; all such devices are named.
@@ -38,6 +39,7 @@ class ServedRig:
         world: Path | None = None,
         transport: Literal["pty", "tcp"] = "pty",
         bind: str = "127.0.0.1",
+        can_interface: str | None = None,
         wire_log: Path | None = None,
     ) -> None:
         self.clock = SystemClock()
@@ -47,6 +49,8 @@ class ServedRig:
         self._wire_log: WireLogWriter | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="microdrivers-")
         request = ServeRequest(transport=transport, bind=bind, folder=Path(self._folder.name))
+        if can_interface is not None:
+            request = replace(request, can="socketcan", can_channel=can_interface)
         self.endpoints: dict[str, Endpoint] = {}
         mute = [name for name, emulation in self.simulation.emulations.items() if emulation.serve is None]
         try:

@@ -6,10 +6,10 @@ from typing import Any
 
 import msgspec
 
-from microdrivers.core.samples import Sample, XYThetaSample, ZoomSample
+from microdrivers.core.samples import ForceSample, PoseSample, Sample, ZoomSample
 from microdrivers.devices.base import Device, DeviceInfo
 from microdrivers.devices.camera import Camera
-from microdrivers.devices.xytheta_stage import XYThetaStage
+from microdrivers.devices.stage import Stage
 
 _COMMON_FIELDS = frozenset(Sample.__struct_fields__) - {"t_ns", "dt_ns", "t_source", "flags"}
 
@@ -26,7 +26,7 @@ def identity_text(info: DeviceInfo) -> str:
 
 def unreferenced_axes(device: Device[Any]) -> list[str]:
     """The axes of a stage whose reference is not known, as the device last reported; [] for other devices."""
-    if not isinstance(device, XYThetaStage):
+    if not isinstance(device, Stage):
         return []
     return [axis for axis, known in device.referenced.items() if not known]
 
@@ -35,8 +35,8 @@ def state_text(device: Device[Any], sample: Sample | None) -> str:
     """The state of a device that was just read, in one line; a camera needs no sample."""
     if isinstance(device, Camera):
         return _camera_text(device)
-    if isinstance(sample, XYThetaSample):
-        parts = [f"x {sample.x_um:.2f} µm, y {sample.y_um:.2f} µm, θ {sample.theta_deg:.5f}°"]
+    if isinstance(sample, PoseSample):
+        parts = [", ".join(_position_text(axis, value) for axis, value in sample.position.items())]
         unknown = unreferenced_axes(device)
         parts.append(f"NOT REFERENCED: {', '.join(unknown)}" if unknown else "referenced")
         parts.append(_motion_text(sample))
@@ -44,6 +44,8 @@ def state_text(device: Device[Any], sample: Sample | None) -> str:
         parts = [f"zoom {sample.zoom:.3f} ({sample.position_steps} steps)"]
         parts.append("referenced" if sample.referenced else "NOT REFERENCED")
         parts.append(_motion_text(sample))
+    elif isinstance(sample, ForceSample):
+        parts = [f"force {sample.force_uN:.3f} µN (raw {sample.raw_uN:.3f}, tare {sample.tare_uN:.3f})"]
     else:
         parts = [f"{key} {value}" for key, value in payload_of(sample).items()]
     if sample is not None and sample.flags:
@@ -56,7 +58,7 @@ def state_data(device: Device[Any], sample: Sample | None) -> dict[str, Any]:
     if isinstance(device, Camera):
         return msgspec.structs.asdict(device.settings)
     data = payload_of(sample)
-    if isinstance(device, XYThetaStage):
+    if isinstance(device, Stage):
         data["referenced"] = dict(device.referenced)
     return data
 
@@ -70,7 +72,11 @@ def payload_of(sample: Sample | None) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if key not in _COMMON_FIELDS}
 
 
-def _motion_text(sample: XYThetaSample | ZoomSample) -> str:
+def _position_text(axis: str, value: float) -> str:
+    return f"θ {value:.5f}°" if axis == "theta" else f"{axis} {value:.2f} µm"
+
+
+def _motion_text(sample: PoseSample | ZoomSample) -> str:
     if sample.moving:
         return "moving"
     return "at rest, on target" if sample.on_target else "at rest"

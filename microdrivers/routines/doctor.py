@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from microdrivers.core.errors import LinkError, MicrodriversError, MotionError
-from microdrivers.core.samples import Sample, XYThetaSample, ZoomSample
+from microdrivers.core.samples import PoseSample, Sample, ZoomSample
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.base import Device
 from microdrivers.devices.camera import Camera
-from microdrivers.devices.xytheta_stage import XYThetaStage
+from microdrivers.devices.force_sensor import INVALID, ForceSensor
+from microdrivers.devices.stage import Stage
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
 from microdrivers.routines.camera_check import LEAST_RATE_SHARE, RATE_TIME_S, STAMP_LIMIT_NS, check_camera
@@ -50,8 +51,8 @@ def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None
 
     Args:
         rig: built and not opened; the caller closes it.
-        motion: also move each referenced x and y axis by ±STEP_UM and compare with its encoder. On an emulated
-            rig, which knows no reference after its power-on, the axes are referenced first.
+        motion: also move each referenced linear axis of a stage by ±STEP_UM and compare with its encoder. On an
+            emulated rig, which knows no reference after its power-on, the axes are referenced first.
         progress: told which device is being examined.
     """
     diagnoses = []
@@ -89,13 +90,13 @@ def _examine(rig: Rig, device: Device[Any], found: DeviceDiagnosis, motion: bool
     last = _check_round_trip(device, found)
     if last is None:
         return
-    if motion and rig.starts_anew and isinstance(device, XYThetaStage) and unreferenced_axes(device):
-        device.reference(unreferenced_axes(device))
+    if motion and rig.starts_anew and isinstance(device, Stage) and unreferenced_axes(device):
+        device.reference([axis for axis in device.reference_order if axis in unreferenced_axes(device)])
         last = device.read()
     _check_state(rig, device, last, found)
     _check_time(device, last, found)
     _check_stream(device, found)
-    if motion and isinstance(device, XYThetaStage):
+    if motion and isinstance(device, Stage):
         _check_motion(device, found)
     if isinstance(device, CountsItsLine):
         _check_line(device.line_counters, found)
@@ -134,15 +135,17 @@ def _check_state(rig: Rig, device: Device[Any], sample: Sample, found: DeviceDia
     file = rig.description.file
     command = f"make sure that the way is free, then: microdrivers reference {file} --device {device.name}"
     axes = unreferenced_axes(device)
-    if axes:
+    if isinstance(device, ForceSensor) and sample.flags & INVALID:
+        found.problem(f"{text}: no valid reading", "free the tip; check sensor, cable, range and zero in the rig file")
+    elif axes:
         found.warn(f"{text} (positions mean nothing yet)", f"{command} --axes {','.join(axes)}")
     elif isinstance(sample, ZoomSample) and not sample.referenced:
         found.warn(f"{text} (the zoom means nothing yet)", command)
     else:
         found.ok(text)
-    if isinstance(sample, XYThetaSample | ZoomSample) and sample.moving:
+    if isinstance(sample, PoseSample | ZoomSample) and sample.moving:
         found.warn("it moves although nobody told it to", f"microdrivers stop {file}")
-    if isinstance(device, XYThetaStage) and isinstance(sample, XYThetaSample):
+    if isinstance(device, Stage) and isinstance(sample, PoseSample):
         for axis, position in sample.position.items():
             if axis not in axes and position not in device.limits[axis]:
                 unit = device.axes[axis].unit
@@ -155,7 +158,7 @@ def _check_state(rig: Rig, device: Device[Any], sample: Sample, found: DeviceDia
 def _check_time(device: Device[Any], sample: Sample, found: DeviceDiagnosis) -> None:
     found.figures |= {"t_source": sample.t_source, "stated_uncertainty_ms": sample.dt_ns / NS_PER_MS}
     what = f"its time is stated to ±{sample.dt_ns / NS_PER_MS:.3g} ms ({sample.t_source})"
-    if isinstance(device, XYThetaStage):
+    if isinstance(device, Stage):
         remedy = "calibrate with --settled; a faster line or a controller on a serial port helps"
         found.judge(sample.dt_ns <= STAMP_LIMIT_NS, what, remedy)
     else:
@@ -164,8 +167,10 @@ def _check_time(device: Device[Any], sample: Sample, found: DeviceDiagnosis) -> 
 
 def _check_stream(device: Device[Any], found: DeviceDiagnosis) -> None:
     wanted_hz = OTHER_RATE_HZ
-    if isinstance(device, XYThetaStage):
+    if isinstance(device, Stage):
         wanted_hz = POSE_RATE_HZ
+    elif isinstance(device, ForceSensor):
+        wanted_hz = device.stream_rate_hz
     elif isinstance(device, ZoomMotor):
         wanted_hz = ZOOM_RATE_HZ
     times_ns: list[int] = []
@@ -198,8 +203,8 @@ def _check_line(counters: Mapping[str, int], found: DeviceDiagnosis) -> None:
 # ---------------------------------------------------------------------- motion
 
 
-def _check_motion(stage: XYThetaStage, found: DeviceDiagnosis) -> None:
-    for axis in ("x", "y"):
+def _check_motion(stage: Stage[Any], found: DeviceDiagnosis) -> None:
+    for axis in _linear_axes(stage):
         if not stage.referenced[axis]:
             found.warn(f"axis {axis} was not moved: it is not referenced", "reference it, then run the doctor again")
             continue
@@ -216,17 +221,17 @@ def _check_motion(stage: XYThetaStage, found: DeviceDiagnosis) -> None:
             found.ok(f"axis {axis} moves as told: by its encoder {', '.join(f'{step:+.2f}' for step in steps_um)} µm")
 
 
-def _step(stage: XYThetaStage, axis: str, goal: float, found: DeviceDiagnosis) -> float | None:
+def _step(stage: Stage[Any], axis: str, goal: float, found: DeviceDiagnosis) -> float | None:
     """Move one axis and compare with the encoders; returns what it moved, None if that is not what it was told."""
     before = _pose(stage)
     asked = goal - before[axis]
     error: MotionError | None = None
     try:
-        stage.move_to(**{f"{axis}_um": goal}, speed_um_s=_step_speed(stage, axis))
+        stage.start_axis_to(axis, goal, speed=_step_speed(stage, axis)).wait()
     except MotionError as failure:
         error = failure
     after = _pose(stage)
-    moved = {name: after[name] - before[name] for name in ("x", "y")}
+    moved = {name: after[name] - before[name] for name in before}
     problem = _judge_step(axis, asked, moved, stage.axes[axis].tolerance, error)
     if problem is None:
         return moved[axis]
@@ -239,8 +244,8 @@ def _judge_step(
     axis: str, asked: float, moved: Mapping[str, float], tolerance_um: float, error: MotionError | None
 ) -> tuple[str, str] | None:
     """What is wrong with a step, and what to try; None if it is right. All in µm."""
-    other = "y" if axis == "x" else "x"
-    if abs(moved[other]) > STEP_UM / 4:
+    others = [name for name in moved if name != axis and abs(moved[name]) > STEP_UM / 4]
+    for other in others[:1]:
         return (
             f"axis {other} moved {moved[other]:+.2f} µm, {axis} itself {moved[axis]:+.2f} µm: wrong axis",
             f"are {axis} and {other} swapped? Check `id` of both axes in the rig file, and the cables",
@@ -265,11 +270,15 @@ def _judge_step(
     )
 
 
-def _pose(stage: XYThetaStage) -> dict[str, float]:
+def _pose(stage: Stage[Any]) -> dict[str, float]:
     """Mean of a few readings at rest."""
     poses = [stage.read().position for _ in range(_POSES)]
-    return {axis: statistics.fmean(pose[axis] for pose in poses) for axis in ("x", "y")}
+    return {axis: statistics.fmean(pose[axis] for pose in poses) for axis in _linear_axes(stage)}
 
 
-def _step_speed(stage: XYThetaStage, axis: str) -> float:
-    return min(_STEP_SPEED_UM_S, stage.max_speed["x"], stage.max_speed["y"], stage.max_speed[axis])
+def _linear_axes(stage: Stage[Any]) -> list[str]:
+    return [axis for axis, spec in stage.axes.items() if spec.unit == "µm"]
+
+
+def _step_speed(stage: Stage[Any], axis: str) -> float:
+    return min(_STEP_SPEED_UM_S, stage.max_speed[axis])

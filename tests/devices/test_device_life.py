@@ -4,7 +4,7 @@ import pytest
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock
-from microdrivers.core.errors import LinkLost, LinkTimeout
+from microdrivers.core.errors import LinkLost, LinkTimeout, ProtocolError
 from microdrivers.core.samples import ZoomSample
 from microdrivers.devices.base import Device, DeviceInfo
 
@@ -16,6 +16,7 @@ class Recorder(Device[ZoomSample]):
 
     def __init__(self, *, answers: bool = True) -> None:
         super().__init__("motor", clock=SimulatedClock(), bus=Bus())
+        self.serial_number = ""
         self.answers = answers
         self.calls: list[str] = []
 
@@ -26,7 +27,7 @@ class Recorder(Device[ZoomSample]):
         self.calls.append("identify")
         if not self.answers:
             raise LinkTimeout("no answer", moved="no")
-        return DeviceInfo(driver="recorder")
+        return DeviceInfo(driver="recorder", serial_number=self.serial_number)
 
     def _close(self) -> None:
         self.calls.append("close")
@@ -83,3 +84,19 @@ def test_nothing_is_sent_to_a_closed_device():
     device.stop()
     device.close()
     assert device.calls == []
+
+
+@pytest.mark.parametrize("other", ["2", ""])
+def test_another_device_in_the_place_of_the_first_is_refused(other):
+    device = Recorder()
+    device.serial_number = "1"
+    device.open()
+    device.close()
+    device.serial_number = other
+    with pytest.raises(ProtocolError, match="answers in the place of 1") as caught:
+        device.open()
+    assert caught.value.moved == "no"
+    assert device.link == "closed"
+    device.serial_number = "1"
+    device.open()
+    assert device.link == "open"

@@ -1,9 +1,11 @@
 """The tare, and what makes a reading invalid; on a sensor that reads what a test tells it."""
 
+import json
 import math
 from collections.abc import Callable
 
 import numpy as np
+import pydantic
 import pytest
 
 from microdrivers.core.bus import Bus
@@ -12,7 +14,8 @@ from microdrivers.core.errors import LinkTimeout, OutOfRange, RefusedError, Satu
 from microdrivers.core.samples import ForceSample
 from microdrivers.core.units import NS_PER_S, Range
 from microdrivers.devices.base import DeviceInfo
-from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, UNTARED, ForceSensor
+from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, STALE, UNTARED, ForceSensor
+from microdrivers.devices.force_sensor_settings import ForceSensorSettings
 
 NOISE_UN = 0.05
 
@@ -126,3 +129,66 @@ def test_a_tare_needs_readings_and_a_sensible_time():
     sensor.stream_rate_hz = 20.0
     with pytest.raises(LinkTimeout, match="readings"):
         sensor.tare(0.1)
+
+
+@pytest.mark.parametrize("flag", [DISCONNECTED, STALE])
+def test_where_there_is_no_sensor_nothing_is_saturated(flag):
+    sensor = opened(lambda _: math.nan)
+    sensor.further = frozenset({flag})
+    assert sensor.read().flags == {flag, UNTARED}
+
+
+def test_a_stream_without_readings_says_so_until_they_are_back():
+    def raw_uN(t_s):
+        if 0.3 <= t_s < 0.6:
+            raise LinkTimeout("no answer")
+        return 1.0
+
+    sensor = opened(raw_uN)
+    samples, kinds = [], []
+    sensor.topic.subscribe(samples.append)
+    sensor.events.subscribe(lambda event: kinds.append(event.kind))
+    with sensor.stream(100.0):
+        sensor.clock.run_for(1.0)
+    stale = [sample for sample in samples if STALE in sample.flags]
+    assert kinds == ["link_lost", "link_back"]
+    assert len(samples) == 101
+    assert len(stale) == 30
+    assert all(0.3 <= sample.t_ns / NS_PER_S < 0.6 and math.isnan(sample.force_uN) for sample in stale)
+    assert [sample.seq for sample in samples] == list(range(101))
+
+
+# ---------------------------------------------------------------------- the rig file
+
+SECTION = {
+    "range_uN": Range(-2000.0, 2000.0), "resolution_uN": 0.01, "bandwidth_hz": 500.0, "stiffness_uN_per_um": 1000.0,
+    "axis": (0.0, 0.6, 0.8), "rate_hz": 1000.0,
+}  # fmt: skip
+
+
+def test_the_rig_file_states_what_the_sensor_is():
+    sensor = opened(lambda _: 0.0)
+    settings = ForceSensorSettings.model_validate_json(json.dumps(SECTION | {"carried_by": "probe_stage"}))
+    sensor._adopt(settings)
+    assert (sensor.range_uN, sensor.stream_rate_hz) == (Range(-2000.0, 2000.0), 1000.0)
+    assert math.hypot(*sensor.axis) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_rounded_unit_vector_is_one():
+    axis = ForceSensorSettings.model_validate(SECTION | {"axis": (0.707, 0.0, 0.707)}).axis
+    assert math.hypot(*axis) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"axis": (0.0, 0.0, 2.0)}, "length 2; write a unit vector"),
+        ({"axis": (0.0, 0.0, 0.0)}, "unit vector"),
+        ({"range_uN": Range(5.0, 5.0)}, "empty or runs backwards"),
+        ({"resolution_uN": 0.0}, "greater than 0"),
+        ({"carried_by": ""}, "at least 1 character"),
+    ],
+)
+def test_what_cannot_be(changes, match):
+    with pytest.raises(pydantic.ValidationError, match=match):
+        ForceSensorSettings.model_validate(SECTION | changes)

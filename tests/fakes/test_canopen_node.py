@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from microdrivers.core.units import NS_PER_MS
 from microdrivers.fakes.canopen import NmtState, Temper
 from tests.fakes.canopen_bench import TEXT, PlainBench, hex_of, shown
 
@@ -54,6 +55,17 @@ def test_a_reset_takes_time_and_ends_with_a_boot_up(command: int, text: str) -> 
     assert bench.application.told == (["restart"] if command == 0x81 else ["lost reset"])
 
 
+@pytest.mark.parametrize("command", [0x02, 0x81, 0x82])
+def test_half_a_transfer_is_forgotten(command: int) -> None:
+    bench = PlainBench()
+    bench.ask("40 08 10 00 00 00 00 00")
+    bench.nmt(command)
+    bench.wait_ms(1)
+    bench.nmt(0x80)
+    assert bench.ask("60 00 00 00 00 00 00 00").startswith("80")
+    assert bench.wait_ms(2000) == []
+
+
 def test_power_cycle_is_silent_until_the_boot_up() -> None:
     bench = PlainBench(temper=Temper((0.0, 0.0), (0.0, 0.0), (0.1, 0.1), (1.0, 1.0)))
     bench.write(0x1017, 20, 2)
@@ -65,7 +77,9 @@ def test_power_cycle_is_silent_until_the_boot_up() -> None:
 def test_heartbeats_tell_the_state_with_the_period_that_was_set() -> None:
     bench = PlainBench()
     bench.write(0x1017, 50, 2)
+    set_ns = bench.t_ns
     assert [shown(frame) for frame in bench.wait_ms(220)] == ["709 [1] 7F"] * 4
+    assert [due.t_ns - set_ns for due in bench.sent[-4:]] == [50 * NS_PER_MS * number for number in (1, 2, 3, 4)]
     bench.nmt(0x01)
     assert {shown(frame) for frame in bench.wait_ms(100)} == {"709 [1] 05"}
     bench.write(0x1017, 0, 2)
