@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 SEED   ?= 0
 OUT    ?= runs/demo
 
-.PHONY: demo test test-vm check format lock bench clean help
+.PHONY: demo test test-vcan test-vm check format lock bench clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p;/^$$/q' Makefile
@@ -27,6 +27,12 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
+
+# The CAN tests on a real SocketCAN bus: this kernel's vcan if it has one, else User Mode Linux, which it fetches once.
+test-vcan: $(READY)
+	$(BIN)/python scripts/vcan-run --setup auto
+	$(BIN)/python scripts/vcan-run -t 300 -- \
+	  $(BIN)/python -m pytest -q -p no:cacheprovider -m vcan $(PYTEST_ARGS) tests/vcan
 
 # The tests that need devices which a container lacks, in an emulated PC. The first time it fetches Debian's kernel.
 test-vm: $(READY)

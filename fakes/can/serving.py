@@ -131,7 +131,7 @@ def _serve_on_interface(name: str, medium: Medium, channel: str) -> Endpoint:
         from microdrivers.fakes.can.interface_bridge import InterfaceBridge
     except ModuleNotFoundError as error:
         raise UnsupportedError(
-            "python-can is not installed", device=name, remedy="pip install 'microdrivers[can]', or serve on slcan"
+            "python-can is not installed", device=name, remedy="pip install python-can, or serve on slcan"
         ) from error
     bridge = InterfaceBridge(medium, channel=channel, device=name)
     return Endpoint(

@@ -7,7 +7,7 @@ target, blur, dust, play of the zoom, latency and stamp error of the camera, lat
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,9 @@ class MicroscopeWorld:
         self.fine_stage_axes = tools.axes
         self.fine_stage_home_um = tools.home_um
         self.fine_stage_power_on_offset_um = tools.power_on_offset_um
-        self.force_uN = tools.force_uN
+        self._tools = tools
+        self.pressed: dict[str, Callable[[int], float]] = {}
+        """By sensor: a force as a function of time that is put on its tip in place of what the tip touches."""
 
     def close(self) -> None:
         """A world holds nothing that must be released."""
@@ -59,6 +61,11 @@ class MicroscopeWorld:
         place = (steps - self._curve_steps[0]) / (self._curve_steps[-1] - self._curve_steps[0])
         engraved = math.exp(float(np.interp(steps, self._curve_steps, self._curve_log_zoom)))
         return engraved * (1.0 + self._curve_error * math.cos(2.0 * math.pi * place))
+
+    def force_uN(self, sensor: str, t_ns: int) -> float:
+        """True force on a sensor's tip along its axis."""
+        pressed = self.pressed.get(sensor)
+        return self._tools.force_uN(sensor, t_ns) if pressed is None else pressed(t_ns)
 
     def corners_px(self, t_ns: int) -> Array:
         """The target's corners, 4×2 px from the principal point."""

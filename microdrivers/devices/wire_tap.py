@@ -13,27 +13,22 @@ class WireTap:
 
     def __init__(self, device: str, bus: Bus) -> None:
         self._device = device
-        self._topic = bus.topic(f"{device}/wire", WireTraffic)
+        self.topic = bus.topic(f"{device}/wire", WireTraffic)
         self._seq = 0
-
-    @property
-    def heard(self) -> bool:
-        """Whether anybody listens."""
-        return self._topic.heard
 
     def sent(self, t_ns: int, data: bytes) -> None:
         """The driver has handed these bytes to the port."""
-        if self.heard:
+        if self.topic.heard:
             self._publish(t_ns, "sent", data)
 
     def received(self, t_ns: int, data: bytes) -> None:
         """The driver has got these bytes from the port."""
-        if self.heard:
+        if self.topic.heard:
             self._publish(t_ns, "received", data)
 
     def _publish(self, t_ns: int, direction: Literal["sent", "received"], data: bytes) -> None:
         seq, self._seq = self._seq, self._seq + 1
-        self._topic.publish(
+        self.topic.publish(
             WireTraffic(
                 t_ns=t_ns, device=self._device, seq=seq, t_source="computed", direction=direction, data=bytes(data)
             )

@@ -49,7 +49,7 @@ def prepared(monkeypatch):
 @pytest.fixture
 def bench(tmp_path):
     """A rig whose wires hang on emulators in real time, and a rig file that reaches them without --fake."""
-    slow = re.sub(r"speed_steps_s: \d+", "speed_steps_s: 2000", shipped_rig().read_text(encoding="utf-8"))
+    slow = re.sub(r"speed_steps_s: \d+", "speed_steps_s: 2000", shipped_rig("microscope").read_text(encoding="utf-8"))
     original = tmp_path / "slow.yaml"
     original.write_text(slow, encoding="utf-8")
     rig = build_rig(original, fake=True, clock=SystemClock())

@@ -49,7 +49,7 @@ def test_help_imports_nothing_heavy():
 
 
 def test_check_says_what_is_there(run):
-    result = run("check", shipped_rig())
+    result = run("check", shipped_rig("microscope"))
     assert result.exit_code == 0
     assert "sample_stage" in result.output
     assert "pi-gcs-xytheta" in result.output
@@ -57,7 +57,7 @@ def test_check_says_what_is_there(run):
 
 def test_an_error_is_one_message_with_place_and_remedy_and_no_traceback(run, tmp_path):
     file = tmp_path / "lab.yaml"
-    file.write_text(shipped_rig().read_text().replace("exposure_ms", "exposure_us"))
+    file.write_text(shipped_rig("microscope").read_text().replace("exposure_ms", "exposure_us"))
     result = run("check", file)
     assert result.exit_code == 1
     assert f"{file}:" in result.output
@@ -73,7 +73,7 @@ def test_debug_shows_the_traceback(run, tmp_path):
 
 
 def test_hardware_that_is_not_there_is_named(run):
-    result = run("calibrate", "optics", "--rig", shipped_rig())
+    result = run("calibrate", "optics", "--rig", shipped_rig("microscope"))
     assert result.exit_code == 1
     assert "3 of 3 devices could not be opened" in result.output
     assert "/dev/ttyUSB0" in result.output
@@ -118,13 +118,13 @@ def test_a_seed_gives_the_same_bits_twice_and_another_seed_others(run, tmp_path)
 
 
 def test_reference_on_the_emulated_rig(run):
-    result = run("reference", shipped_rig(), "--axes", "theta,x,y", "--fake")
+    result = run("reference", shipped_rig("microscope"), "--axes", "theta,x,y", "--fake")
     assert result.exit_code == 0, result.output
     assert "theta, x, y referenced" in result.output
 
 
 @pytest.mark.parametrize("axes", ["z", "x,x", ","])
 def test_reference_refuses_axes_that_are_not_there(run, axes):
-    result = run("reference", shipped_rig(), "--axes", axes, "--fake")
+    result = run("reference", shipped_rig("microscope"), "--axes", axes, "--fake")
     assert result.exit_code == 1
     assert "axes to reference" in result.output

@@ -11,6 +11,8 @@ from microdrivers.configs import shipped_rig
 from microdrivers.core.samples import ZoomSample
 from microdrivers.fakes.wire import Wire, wire_named
 
+RIG = shipped_rig("microscope")
+
 COMMANDS = ["status", "move", "stop", "snap", "doctor", "reference"]
 
 
@@ -30,7 +32,7 @@ def test_a_missing_rig_file_is_one_clear_message(run, command):
 
 
 def test_a_world_without_fake_is_refused(run):
-    result = run("status", shipped_rig(), "--seed", 3)
+    result = run("status", RIG, "--seed", 3)
     assert result.exit_code == 1
     assert "add --fake" in result.output
 
@@ -39,7 +41,7 @@ def test_a_world_without_fake_is_refused(run):
 
 
 def test_status_has_one_line_a_device(run):
-    result = run("status", shipped_rig(), "--fake")
+    result = run("status", RIG, "--fake")
     assert result.exit_code == 0, result.output
     stage, zoom, camera = result.stdout.splitlines()
     assert stage.startswith("sample_stage  Physik Instrumente")
@@ -51,7 +53,7 @@ def test_status_has_one_line_a_device(run):
 
 
 def test_status_as_json_is_json_and_nothing_else(run):
-    result = run("status", shipped_rig(), "--fake", "--json")
+    result = run("status", RIG, "--fake", "--json")
     found = json.loads(result.stdout)["devices"]
     assert found["sample_stage"]["state"]["referenced"] == {"x": False, "y": False, "theta": False}
     assert found["sample_stage"]["state"]["target_x_um"] is None
@@ -62,7 +64,7 @@ def test_status_as_json_is_json_and_nothing_else(run):
 
 def test_status_shows_the_others_if_one_is_unplugged(run, prepared):
     prepared(lambda rig: wire_named("sample_stage").unplug())
-    result = run("status", shipped_rig(), "--fake")
+    result = run("status", RIG, "--fake")
     assert result.exit_code == 1
     stage, zoom, camera = result.stdout.splitlines()
     assert "ERROR" in stage
@@ -72,7 +74,7 @@ def test_status_shows_the_others_if_one_is_unplugged(run, prepared):
 
 
 def test_status_names_missing_hardware(run):
-    result = run("status", shipped_rig())
+    result = run("status", RIG)
     assert result.exit_code == 1
     assert result.stdout.count("ERROR") == 3
     assert "/dev/ttyUSB0" in result.stdout
@@ -83,7 +85,18 @@ def test_status_names_missing_hardware(run):
 
 
 def test_move_reports_where_the_stage_was_seen(run):
-    result = run("move", shipped_rig(), "sample_stage", "--x-um", 7600, "--y-um", 7450.5, "--speed-um-s", 500, "--fake")
+    result = run(
+        "move",
+        RIG,
+        "sample_stage",
+        "--x-um",
+        7600,
+        "--y-um",
+        7450.5,
+        "--speed-um-s",
+        500,
+        "--fake",
+    )
     assert result.exit_code == 0, result.output
     x_um, y_um = (float(text) for text in re.findall(r"[xy] (\d+\.\d+) µm", result.stdout))
     assert (x_um, y_um) == pytest.approx((7600, 7450.5), abs=0.2)
@@ -92,15 +105,15 @@ def test_move_reports_where_the_stage_was_seen(run):
 
 
 def test_move_by_counts_from_where_the_device_is(run):
-    moved = run("move", shipped_rig(), "sample_stage", "--by", "--x-um", -20, "--theta-deg", 0.5, "--fake")
+    moved = run("move", RIG, "sample_stage", "--by", "--x-um", -20, "--theta-deg", 0.5, "--fake")
     assert "x 7480.0" in moved.stdout or "x 7479.9" in moved.stdout
     assert "θ 0.5" in moved.stdout or "θ 0.4999" in moved.stdout
 
 
 def test_move_sets_the_zoom(run):
-    assert "zoom 1.2" in run("move", shipped_rig(), "zoom", "--zoom", 1.2, "--fake").stdout
-    there = float(re.search(r"zoom (\S+) \(", run("status", shipped_rig(), "--fake").stdout)[1])
-    after = run("move", shipped_rig(), "zoom", "--by", "--zoom", 0.3, "--fake").stdout
+    assert "zoom 1.2" in run("move", RIG, "zoom", "--zoom", 1.2, "--fake").stdout
+    there = float(re.search(r"zoom (\S+) \(", run("status", RIG, "--fake").stdout)[1])
+    after = run("move", RIG, "zoom", "--by", "--zoom", 0.3, "--fake").stdout
     assert float(re.search(r"zoom (\S+) \(", after)[1]) == pytest.approx(there + 0.3, abs=0.003)
 
 
@@ -121,7 +134,7 @@ def test_move_sets_the_zoom(run):
 )
 def test_move_refuses_and_moves_nothing(run, prepared, arguments, what):
     emulators = prepared()
-    result = run("move", shipped_rig(), *arguments, "--fake")
+    result = run("move", RIG, *arguments, "--fake")
     assert result.exit_code == 1
     assert what in result.output
     assert not [text for _, text in emulators[0].events if text.startswith("move")]
@@ -145,7 +158,7 @@ def test_ctrl_c_during_a_move_stops_the_stage(run, prepared, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Wire, "write", interrupting)
-    result = run("move", shipped_rig(), "sample_stage", "--x-um", 12_000, "--fake")
+    result = run("move", RIG, "sample_stage", "--x-um", 12_000, "--fake")
     assert result.exit_code == 130
     texts = [text for _, text in emulators[0].events]
     moved = next(number for number, text in enumerate(texts) if text.startswith("move x"))
@@ -157,7 +170,7 @@ def test_ctrl_c_during_a_move_stops_the_stage(run, prepared, monkeypatch):
 
 def test_stop_tells_all_that_moves(run, prepared):
     emulators = prepared()
-    result = run("stop", shipped_rig(), "--fake")
+    result = run("stop", RIG, "--fake")
     assert result.exit_code == 0, result.output
     assert result.stdout.count("told to stop") == 2
     assert "camera_fine" not in result.stdout
@@ -166,7 +179,7 @@ def test_stop_tells_all_that_moves(run, prepared):
 
 def test_stop_reaches_the_others_if_one_is_unplugged_and_says_so(run, prepared):
     prepared(lambda rig: wire_named("zoom").unplug())
-    result = run("stop", shipped_rig(), "--fake")
+    result = run("stop", RIG, "--fake")
     assert result.exit_code == 1
     assert re.search(r"sample_stage\s+told to stop", result.stdout)
     assert re.search(r"zoom\s+NOT REACHED", result.stdout)
@@ -174,7 +187,7 @@ def test_stop_reaches_the_others_if_one_is_unplugged_and_says_so(run, prepared):
 
 
 def test_stop_without_hardware_says_what_could_not_be_reached(run):
-    result = run("stop", shipped_rig())
+    result = run("stop", RIG)
     assert result.exit_code == 1
     assert result.stdout.count("NOT REACHED") == 2
     assert "another program" in result.stdout
@@ -187,7 +200,7 @@ class KeepsMoving(GcsXYThetaStage):
 
 def test_stop_does_not_call_stopped_what_still_moves(run, prepared):
     prepared(sample_stage=KeepsMoving)
-    result = run("stop", shipped_rig(), "--fake")
+    result = run("stop", RIG, "--fake")
     assert result.exit_code == 1
     assert re.search(r"sample_stage.*STILL MOVING", result.stdout)
 
@@ -212,7 +225,7 @@ def test_stop_halts_a_motor_that_another_program_left_moving(run, bench):
 
 
 def test_doctor_ends_with_a_summary(run):
-    result = run("doctor", shipped_rig(), "--fake", "--motion", "--seed", 2)
+    result = run("doctor", RIG, "--fake", "--motion", "--seed", 2)
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines()[-1] == "3 devices: 21 OK, no warnings, no problems"
     assert "emulated" in result.stdout
@@ -225,7 +238,7 @@ def test_doctor_as_json_holds_findings_and_figures(run, prepared):
         wire_named("zoom").unplug()
 
     prepared(without_camera)
-    result = run("doctor", shipped_rig(), "--fake", "--json")
+    result = run("doctor", RIG, "--fake", "--json")
     assert result.exit_code == 1
     stage, zoom = json.loads(result.stdout)["devices"]
     assert stage["figures"]["read_median_ms"] > 0
@@ -233,7 +246,7 @@ def test_doctor_as_json_holds_findings_and_figures(run, prepared):
 
 
 def test_doctor_without_hardware_shows_every_device_with_what_to_try(run):
-    result = run("doctor", shipped_rig())
+    result = run("doctor", RIG)
     assert result.exit_code == 1
     assert result.stdout.count("PROBLEM") == 3
     assert result.stdout.count("try: ") == 3
@@ -252,7 +265,7 @@ def test_hardware_is_moved_only_after_a_yes(run, bench, command):
 
 
 def test_reference_finds_the_zooms_too(run):
-    result = run("reference", shipped_rig(), "--device", "zoom", "--fake")
+    result = run("reference", RIG, "--device", "zoom", "--fake")
     assert result.exit_code == 0, result.output
     assert "reference found; now at zoom" in result.stdout
 
@@ -268,7 +281,7 @@ def test_reference_finds_the_zooms_too(run):
 )
 def test_reference_refuses_before_anything_is_opened(run, prepared, arguments, what):
     emulators = prepared()
-    result = run("reference", shipped_rig(), *arguments, "--fake")
+    result = run("reference", RIG, *arguments, "--fake")
     assert result.exit_code == 1
     assert what in result.output
     assert emulators[0].events == []

@@ -10,7 +10,7 @@ from microdrivers.configs import shipped_rig
 
 
 def test_snap_writes_a_fresh_frame_and_says_how_it_was_taken(run, tmp_path):
-    result = run("snap", shipped_rig(), "--out", "a.png", "--exposure-ms", 4, "--fake")
+    result = run("snap", shipped_rig("microscope"), "--out", "a.png", "--exposure-ms", 4, "--fake")
     assert result.exit_code == 0, result.output
     image = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert image.shape == (480, 640)
@@ -31,7 +31,7 @@ class Deep(SourceCamera):
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.TIFF"])
 def test_snap_keeps_the_bit_depth(run, prepared, tmp_path, name):
     prepared(camera_fine=Deep)
-    result = run("snap", shipped_rig(), "camera_fine", "--out", name, "--fake")
+    result = run("snap", shipped_rig("microscope"), "camera_fine", "--out", name, "--fake")
     assert result.exit_code == 0, result.output
     image = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)
     assert image.dtype == np.uint16
@@ -44,11 +44,11 @@ def test_snap_keeps_the_bit_depth(run, prepared, tmp_path, name):
 def test_snap_never_overwrites_unasked(run, tmp_path):
     file = tmp_path / "a.png"
     file.write_text("precious")
-    refused = run("snap", shipped_rig(), "--out", "a.png", "--fake")
+    refused = run("snap", shipped_rig("microscope"), "--out", "a.png", "--fake")
     assert refused.exit_code == 1
     assert "--force" in refused.output
     assert file.read_text() == "precious"
-    assert run("snap", shipped_rig(), "--out", "a.png", "--fake", "--force").exit_code == 0
+    assert run("snap", shipped_rig("microscope"), "--out", "a.png", "--fake", "--force").exit_code == 0
     assert cv2.imread(str(file)) is not None
 
 
@@ -65,13 +65,13 @@ def test_snap_never_overwrites_unasked(run, tmp_path):
     ],
 )
 def test_snap_refuses(run, tmp_path, arguments, what):
-    result = run("snap", shipped_rig(), *arguments, "--fake")
+    result = run("snap", shipped_rig("microscope"), *arguments, "--fake")
     assert result.exit_code == 1
     assert what in result.output
     assert not list(tmp_path.iterdir())
 
 
 def test_a_long_exposure_lowers_the_rate(run):
-    result = run("snap", shipped_rig(), "--out", "a.png", "--exposure-ms", 80, "--fake")
+    result = run("snap", shipped_rig("microscope"), "--out", "a.png", "--exposure-ms", 80, "--fake")
     assert result.exit_code == 0, result.output
     assert "exposure      80 ms" in result.stdout

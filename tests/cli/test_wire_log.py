@@ -11,7 +11,9 @@ from microdrivers.devices.wire_log_format import read_wire_log
 from microdrivers.rig import load_rig_file, open_rig
 from microdrivers.rig.serving import ServedRig
 
-MOVE = ["move", shipped_rig(), "sample_stage", "--x-um", 7600, "--y-um", 7450]
+RIG = shipped_rig("microscope")
+
+MOVE = ["move", RIG, "sample_stage", "--x-um", 7600, "--y-um", 7450]
 
 
 @pytest.mark.parametrize("command", ["status", "doctor", "move", "reference", "stop", "snap"])
@@ -34,13 +36,13 @@ def test_the_other_commands_can_log(run, command):
 )
 def test_a_command_prints_the_same_from_its_log(run, command):
     name, *options = command
-    logged = run(name, shipped_rig(), *options, "--fake", "--wire-log", "wire.jsonl")
-    replayed = run(name, shipped_rig(), *options, "--wire-replay", "wire.jsonl")
+    logged = run(name, RIG, *options, "--fake", "--wire-log", "wire.jsonl")
+    replayed = run(name, RIG, *options, "--wire-replay", "wire.jsonl")
     assert logged.exit_code == replayed.exit_code == 0, replayed.output
 
     def devices(text):
         """What is said of devices, the camera and headings excepted."""
-        return [line for line in re.split(r"camera_fine|\d devices", text)[0].splitlines() if "workstation" not in line]
+        return [line for line in re.split(r"camera_fine|\d devices", text)[0].splitlines() if "microscope" not in line]
 
     assert devices(replayed.stdout) == devices(logged.stdout) != []
 
@@ -51,7 +53,7 @@ def test_a_move_replays_and_another_move_does_not(run, caplog):
     assert replayed.exit_code == 0, replayed.output
     assert replayed.stdout == logged.stdout
     assert "no answer" not in caplog.text
-    other = run("move", shipped_rig(), "sample_stage", "--x-um", 7700, "--wire-replay", "wire.jsonl")
+    other = run("move", RIG, "sample_stage", "--x-um", 7700, "--wire-replay", "wire.jsonl")
     assert other.exit_code == 1
     assert re.search(r'no answer to "VEL|no answer to "MOV', caplog.text)
 
@@ -67,12 +69,12 @@ def test_a_log_from_hardware_replays_without_what_only_emulators_need(run, tmp_p
 
 
 def test_a_cut_reply_fails_again_in_the_replay(run, tmp_path):
-    run("status", shipped_rig(), "--fake", "--wire-log", "wire.jsonl")
+    run("status", RIG, "--fake", "--wire-log", "wire.jsonl")
     log = tmp_path / "wire.jsonl"
     lines = log.read_text(encoding="utf-8").splitlines(keepends=True)
     end = max(number for number, line in enumerate(lines) if '"sample_stage", "direction": "received"' in line)
     log.write_text("".join(lines[:end] + lines[end + 1 :]), encoding="utf-8")
-    result = run("status", shipped_rig(), "--wire-replay", "wire.jsonl")
+    result = run("status", RIG, "--wire-replay", "wire.jsonl")
     assert result.exit_code == 1
     stage, zoom = result.stdout.splitlines()
     assert "only a part of the reply" in stage
@@ -80,17 +82,21 @@ def test_a_cut_reply_fails_again_in_the_replay(run, tmp_path):
 
 
 def test_the_log_tells_what_was_run_on_which_rig_and_holds_events(run, tmp_path):
-    run("snap", shipped_rig(), "--out", "frame.png", "--fake", "--seed", 4, "--wire-log", "wire.jsonl")
+    run("snap", RIG, "--out", "frame.png", "--fake", "--seed", 4, "--wire-log", "wire.jsonl")
     log = read_wire_log(tmp_path / "wire.jsonl")
     assert (log.header.source, log.header.seed) == ("fake", 4)
-    assert log.header.rig == load_rig_file(shipped_rig()).as_data()
+    assert log.header.rig == load_rig_file(RIG).as_data()
     assert [record.kind for record in log.records] == ["opened", "stopped", "closed"]
 
 
 def test_an_existing_log_is_kept_and_nothing_is_opened(run, prepared, tmp_path):
     emulators = prepared()
     (tmp_path / "wire.jsonl").write_text("evidence", encoding="utf-8")
-    for command in (["status", shipped_rig(), "--fake"], ["calibrate", "optics"], ["serve", shipped_rig()]):
+    for command in (
+        ["status", RIG, "--fake"],
+        ["calibrate", "optics"],
+        ["serve", RIG],
+    ):
         result = run(*command, "--wire-log", "wire.jsonl")
         assert result.exit_code == 1
         assert "wire.jsonl: the file exists" in result.output
@@ -99,20 +105,20 @@ def test_an_existing_log_is_kept_and_nothing_is_opened(run, prepared, tmp_path):
 
 
 def test_a_log_that_cannot_be_written_is_refused(run):
-    result = run("status", shipped_rig(), "--fake", "--wire-log", "none/wire.jsonl")
+    result = run("status", RIG, "--fake", "--wire-log", "none/wire.jsonl")
     assert result.exit_code == 1
     assert "none/wire.jsonl: the wire log cannot be written there" in result.output
 
 
 def test_a_command_that_opened_nothing_leaves_no_log(run, tmp_path, caplog):
-    assert run("move", shipped_rig(), "zoom", "--x-um", 1, "--fake", "--wire-log", "wire.jsonl").exit_code == 1
+    assert run("move", RIG, "zoom", "--x-um", 1, "--fake", "--wire-log", "wire.jsonl").exit_code == 1
     assert not (tmp_path / "wire.jsonl").exists()
     assert "nothing passed on any wire" in caplog.text
 
 
 @pytest.mark.parametrize("options", [["--fake"], ["--seed", 1], ["--world", "world.yaml"]])
 def test_replay_and_simulation_exclude_each_other(run, options):
-    result = run("status", shipped_rig(), "--wire-replay", "wire.jsonl", *options)
+    result = run("status", RIG, "--wire-replay", "wire.jsonl", *options)
     assert result.exit_code == 1
     assert "takes the place of a simulation" in result.output
 
@@ -134,7 +140,7 @@ def test_images_have_no_wires(run):
 def test_a_file_that_is_no_wire_log_is_refused(run, tmp_path, text, what):
     if text is not None:
         (tmp_path / "wire.jsonl").write_text(text, encoding="utf-8")
-    result = run("status", shipped_rig(), "--wire-replay", "wire.jsonl")
+    result = run("status", RIG, "--wire-replay", "wire.jsonl")
     assert result.exit_code == 1
     assert what in result.output
 
@@ -142,7 +148,7 @@ def test_a_file_that_is_no_wire_log_is_refused(run, tmp_path, text, what):
 @pytest.mark.xdist_group("real_time")
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
 def test_a_served_rig_logs_what_its_emulators_see(run, tmp_path, transport):
-    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    data = yaml.safe_load(RIG.read_text(encoding="utf-8"))
     del data["microscope"], data["devices"]["camera_fine"]
     rig_file, served_file, log = tmp_path / "rig.yaml", tmp_path / "served.yaml", tmp_path / "wire.jsonl"
     rig_file.write_text(yaml.safe_dump(data), encoding="utf-8")

@@ -140,7 +140,7 @@ def _replace(rig: Rig, name: str, driver: type[Any] | None) -> None:
 
 
 def _emulated(seed: int, file: Path | None = None) -> Rig:
-    return build_rig(file or shipped_rig(), fake=True, seed=seed, clock=SimulatedClock())
+    return build_rig(file or shipped_rig("microscope"), fake=True, seed=seed, clock=SimulatedClock())
 
 
 @contextmanager
@@ -173,12 +173,13 @@ def served(
     seed: int = 3,
     file: Path | None = None,
     drivers: Mapping[str, type[Any]] | None = None,
+    can_interface: str | None = None,
 ) -> Iterator[tuple[Rig, ServedRig]]:
     """Some devices of a rig file (the workstation) in real time, on ports of the operating system.
 
     `drivers` are others, such as ones with a planted fault, by the device that they are put in front of.
     """
-    data = yaml.safe_load((file or shipped_rig()).read_text(encoding="utf-8"))
+    data = yaml.safe_load((file or shipped_rig("microscope")).read_text(encoding="utf-8"))
     data.pop("microscope")
     data["devices"] = {name: data["devices"][name] for name in devices}
     with tempfile.TemporaryDirectory() as folder:
@@ -186,7 +187,10 @@ def served(
         part.write_text(yaml.safe_dump(data), encoding="utf-8")
         world = Path(folder) / "world.yaml"
         world.write_text("stage: {power_on_spread_um: 30}\n", encoding="utf-8")  # a short way to the reference
-        with ServedRig(load_rig_file(part), transport=transport, seed=seed, world=world) as serving:
+        description = load_rig_file(part)
+        with ServedRig(
+            description, transport=transport, seed=seed, world=world, can_interface=can_interface
+        ) as serving:
             serving.write(pointing)
             rig = build_rig(pointing)
             for name, driver in (drivers or {}).items():

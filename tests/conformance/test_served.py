@@ -19,7 +19,7 @@ pytestmark = pytest.mark.xdist_group("real_time")
 @pytest.fixture
 def modbus_tcp_rig(tmp_path):
     """The workstation with its zoom motor behind a Modbus TCP gateway."""
-    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    data = yaml.safe_load(shipped_rig("microscope").read_text(encoding="utf-8"))
     data["devices"]["zoom"]["connection"] = {"port": "socket://127.0.0.1:502", "framing": "tcp", "timeout_s": 0.5}
     file = tmp_path / "gateway.yaml"
     file.write_text(yaml.safe_dump(data), encoding="utf-8")

@@ -16,6 +16,8 @@ from microdrivers.devices.camera import Camera
 from microdrivers.fakes.wire.replay import LoggedRequest, ReplayEmulator, logged_requests
 from microdrivers.rig import open_rig
 
+RIG = shipped_rig("microscope")
+
 LOG = [
     LoggedRequest(b"A\n", [(10, b"1")]),
     LoggedRequest(b"STOP", []),
@@ -147,7 +149,7 @@ def readings(rig):
 def recorded(tmp_path):
     """A log of opening the emulated workstation and reading its stage and its zoom once, and what they said."""
     file = tmp_path / "wire.jsonl"
-    with open_rig(shipped_rig(), fake=True, seed=3, clock=SimulatedClock(), wire_log=file) as rig:
+    with open_rig(RIG, fake=True, seed=3, clock=SimulatedClock(), wire_log=file) as rig:
         said = readings(rig)
     return file, said
 
@@ -168,7 +170,7 @@ def last_reply(file, device):
 
 def test_a_rig_reads_from_its_log_what_it_read_when_the_log_was_taken(recorded, caplog):
     file, said = recorded
-    with open_rig(str(shipped_rig()), wire_replay=str(file)) as rig:
+    with open_rig(str(RIG), wire_replay=str(file)) as rig:
         assert rig.fake
         assert rig.clock.simulated
         assert readings(rig) == said
@@ -184,7 +186,7 @@ def test_a_bug_report_becomes_a_test(recorded):
     file, _ = recorded
     cut = last_reply(file, "sample_stage")
     edit(file, lambda record: None if record == cut else record)
-    with open_rig(shipped_rig(), wire_replay=file) as rig, pytest.raises(LinkTimeout, match="only a part"):
+    with open_rig(RIG, wire_replay=file) as rig, pytest.raises(LinkTimeout, match="only a part"):
         rig.devices["sample_stage"].read()
 
 
@@ -193,7 +195,7 @@ def test_a_garbled_reply_is_replayed_byte_for_byte(recorded):
     bad = last_reply(file, "sample_stage")
     garbled = {key: value for key, value in bad.items() if key != "text"} | {"hex": "FF 00 B5 0A"}
     edit(file, lambda record: garbled if record == bad else record)
-    with open_rig(shipped_rig(), wire_replay=file) as rig, pytest.raises(ProtocolError) as caught:
+    with open_rig(RIG, wire_replay=file) as rig, pytest.raises(ProtocolError) as caught:
         rig.devices["sample_stage"].read()
     assert caught.value.received.endswith(b"\xff\x00\xb5\n")
 
@@ -202,13 +204,13 @@ def test_a_late_reply_comes_as_late_as_it_did(recorded):
     file, _ = recorded
     late = last_reply(file, "zoom")
     edit(file, lambda record: record | {"t_s": record["t_s"] + 0.3} if record == late else record)
-    with open_rig(shipped_rig(), wire_replay=file) as rig, pytest.raises(LinkTimeout, match="zoom"):
+    with open_rig(RIG, wire_replay=file) as rig, pytest.raises(LinkTimeout, match="zoom"):
         rig.devices["zoom"].read()
 
 
 def test_what_the_log_cannot_answer_is_reported_once(recorded, caplog):
     file, _ = recorded
-    with open_rig(shipped_rig(), wire_replay=file) as rig, pytest.raises(LinkTimeout):
+    with open_rig(RIG, wire_replay=file) as rig, pytest.raises(LinkTimeout):
         rig.devices["zoom"].move_to(zoom=5.0)
     rig.close()
     complaints = [record.getMessage() for record in caplog.records if "no answer" in record.getMessage()]
@@ -220,7 +222,7 @@ def test_what_the_log_cannot_answer_is_reported_once(recorded, caplog):
 
 def test_a_rig_file_that_differs_from_the_logs_is_named(recorded, tmp_path, caplog):
     file, _ = recorded
-    text = shipped_rig().read_text(encoding="utf-8")
+    text = RIG.read_text(encoding="utf-8")
     other = tmp_path / "other.yaml"
     other.write_text(
         text.replace("backlash_steps: 20", "backlash_steps: 30").replace("ttyUSB0", "ttyUSB7"), encoding="utf-8"
@@ -237,7 +239,7 @@ def test_a_log_of_other_devices_is_refused(recorded):
     edit(file, lambda record: record | {"device": f"other_{record['device']}"})
     with (
         pytest.raises(ConfigError, match="nothing passed on the wire") as caught,
-        open_rig(shipped_rig(), wire_replay=file),
+        open_rig(RIG, wire_replay=file),
     ):
         pass
     assert "sample_stage" in caught.value.remedy
@@ -245,7 +247,10 @@ def test_a_log_of_other_devices_is_refused(recorded):
 
 def test_a_replay_excludes_a_simulation(recorded):
     file, _ = recorded
-    with pytest.raises(ConfigError, match="takes the place"), open_rig(shipped_rig(), fake=True, wire_replay=file):
+    with (
+        pytest.raises(ConfigError, match="takes the place"),
+        open_rig(RIG, fake=True, wire_replay=file),
+    ):
         pass
 
 
@@ -253,14 +258,14 @@ def test_a_world_file_may_name_the_log(recorded, tmp_path):
     file, said = recorded
     world = tmp_path / "replay.yaml"
     world.write_text(f"world: wire-log\nlog: {file}\n", encoding="utf-8")
-    with open_rig(shipped_rig(), fake=True, clock=SimulatedClock(), world=world) as rig:
+    with open_rig(RIG, fake=True, clock=SimulatedClock(), world=world) as rig:
         assert readings(rig) == said
 
 
 def test_a_replay_can_be_logged_again(recorded, tmp_path):
     file, said = recorded
     again = tmp_path / "again.jsonl"
-    with open_rig(shipped_rig(), wire_replay=file, wire_log=again) as rig:
+    with open_rig(RIG, wire_replay=file, wire_log=again) as rig:
         assert readings(rig) == said
 
     def traffic(log):

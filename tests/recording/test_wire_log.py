@@ -256,10 +256,10 @@ def test_a_full_disk_ends_the_log_and_not_the_run(file, caplog, monkeypatch):
     for t_ns in range(3):
         tap.sent(t_ns, b"x")
     for _ in range(1000):
-        if not tap.heard:
+        if not tap.topic.heard:
             break
         time.sleep(0.005)
-    assert not tap.heard
+    assert not tap.topic.heard
     log.close()
     assert caplog.text.count("No space left on device") == 1
 

@@ -5,10 +5,10 @@ import re
 import pytest
 
 from microdrivers.configs import shipped_rig
-from microdrivers.core.errors import ConfigError, ConfigErrors
+from microdrivers.core.errors import ConfigError, ConfigErrors, UnsupportedError
 from microdrivers.rig import load_rig_file
 
-GOOD = shipped_rig().read_text(encoding="utf-8")
+GOOD = shipped_rig("microscope").read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -24,8 +24,28 @@ def edited(tmp_path):
     return edit
 
 
-def test_the_shipped_rig_is_valid():
+def test_the_whole_workstation_is_valid_and_can_be_opened_in_part():
     description = load_rig_file(shipped_rig())
+    kinds = {name: entry.driver.kind.__name__ for name, entry in description.devices.items()}
+    assert kinds == {
+        "sample_stage": "XYThetaStage",
+        "probe_stage": "FineStage",
+        "gripper_stage": "FineStage",
+        "zoom": "ZoomMotor",
+        "probe_force": "ForceSensor",
+        "gripper_force": "ForceSensor",
+        "camera_coarse": "Camera",
+        "camera_fine": "Camera",
+        "camera_lateral": "Camera",
+    }
+    assert set(description.restricted_to(["zoom", "probe_stage"]).devices) == {"zoom", "probe_stage"}
+    assert description.microscope_devices == ("sample_stage", "zoom", "camera_fine")
+    with pytest.raises(UnsupportedError, match="gripper_satge"):
+        description.restricted_to(["gripper_satge"])
+
+
+def test_the_optical_half_is_valid():
+    description = load_rig_file(shipped_rig("microscope"))
     assert list(description.devices) == ["sample_stage", "zoom", "camera_fine"]
     assert description.as_data()["devices"]["zoom"]["backlash_steps"] == 20
 
@@ -38,7 +58,7 @@ MISTAKES = {
         "unknown key",
         "did you mean 'max_speed_um_s'",
     ),
-    "unknown key at the top": ("name: workstation", "nmae: workstation", "unknown key", "did you mean 'name'"),
+    "unknown key at the top": ("name: microscope", "nmae: microscope", "unknown key", "did you mean 'name'"),
     "unit in the value": ("tolerance_um: 0.15", "tolerance_um: 0.15 um", "is not a number", "unit is part of the key"),
     "out of range": ("unit_id: 1", "unit_id: 40", "less than or equal to 31", "correct the value"),
     "negative": ("acceleration_um_s2: 20000", "acceleration_um_s2: -1", "greater than 0", "correct the value"),

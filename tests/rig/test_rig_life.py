@@ -14,11 +14,11 @@ from microdrivers.rig import simulation as simulation_module
 
 
 def emulated(**options):
-    return build_rig(shipped_rig(), fake=True, clock=SimulatedClock(), **options)
+    return build_rig(shipped_rig("microscope"), fake=True, clock=SimulatedClock(), **options)
 
 
 def test_without_hardware_every_device_that_failed_is_named_with_a_remedy():
-    with pytest.raises(ConnectError) as caught, open_rig(shipped_rig(), clock=SystemClock()):
+    with pytest.raises(ConnectError) as caught, open_rig(shipped_rig("microscope"), clock=SystemClock()):
         pass
     text = str(caught.value)
     assert "3 of 3 devices" in text

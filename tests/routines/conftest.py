@@ -42,7 +42,7 @@ def calibrate():
         progress: Any = None,
         **settings: Any,
     ) -> Calibration:
-        rig = build_rig(shipped_rig(), fake=True, seed=seed, clock=SimulatedClock(), world=world)
+        rig = build_rig(shipped_rig("microscope"), fake=True, seed=seed, clock=SimulatedClock(), world=world)
         assert rig.simulation is not None
         for name, driver in (drivers or {}).items():
             own = rig.simulation.settings_of(name)

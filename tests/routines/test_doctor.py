@@ -20,7 +20,7 @@ def examine():
     """Diagnose the emulated workstation; returns the devices by name. If drivers are replaced, only these devices."""
 
     def call(*, motion=False, prepare=lambda rig: None, **drivers):
-        rig = build_rig(shipped_rig(), fake=True, seed=4, clock=SimulatedClock())
+        rig = build_rig(shipped_rig("microscope"), fake=True, seed=4, clock=SimulatedClock())
         for name, driver in drivers.items():
             rig.devices[name] = driver(name, rig.simulation.settings_of(name), clock=rig.clock, bus=rig.bus)
         if drivers:

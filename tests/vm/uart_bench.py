@@ -88,7 +88,7 @@ def on_the_uart(name, *, seed=3, host_parity=None, timeout_s=10.0, **changes):
 
     `host_parity` is what the driver is set to, if not what the device has; `changes` are settings of the driver.
     """
-    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    data = yaml.safe_load(shipped_rig("microscope").read_text(encoding="utf-8"))
     data.pop("microscope")
     data["devices"] = {name: data["devices"][name]}
     clock, bus = SystemClock(), Bus()

@@ -11,12 +11,16 @@ from contextlib import contextmanager
 
 
 class Interruption:
-    """What a signal handler asks for, and when it may happen."""
+    """What a signal handler asks for, and when it may happen.
+
+    Attributes:
+        requested: whether an interruption is being kept.
+    """
 
     def __init__(self) -> None:
         self._rigs_open = 0
         self._waiting = False
-        self._requested = False
+        self.requested = False
         self._signals = 0
 
     def request(self) -> None:
@@ -27,14 +31,14 @@ class Interruption:
         """
         self._signals += 1
         if self._rigs_open == 0 or self._waiting or self._signals > 1:
-            self._requested = False
+            self.requested = False
             raise KeyboardInterrupt
-        self._requested = True
+        self.requested = True
 
     def check(self) -> None:
         """Let a kept interruption happen; called where nothing is half done."""
-        if self._requested:
-            self._requested = False
+        if self.requested:
+            self.requested = False
             raise KeyboardInterrupt
 
     @contextmanager
@@ -51,7 +55,7 @@ class Interruption:
         """From now on interruptions are kept until the main program waits."""
         self._rigs_open += 1
         self._signals = 0
-        self._requested = False  # one that came too late for the last rig is not meant for this one
+        self.requested = False  # one that came too late for the last rig is not meant for this one
 
     def rig_closed(self) -> None:
         """The end of that."""
