@@ -46,3 +46,7 @@ class CameraDeviceSettings(DeviceSettings):
         if self.exposure_ms * self.rate_hz > 1000:
             raise ValueError(f"exposure_ms = {self.exposure_ms:g} does not fit rate_hz = {self.rate_hz:g}")
         return self
+
+    def claims(self) -> tuple[str, ...]:
+        """The camera, unless many may watch it."""
+        return (f"camera {self.source}",) if self.source.startswith("v4l2") else ()

@@ -48,3 +48,7 @@ class Cia404ForceSettings(ForceSensorSettings):
     def load_at(self, rate_hz: float) -> float:
         """Share of the bus that a stream takes at most."""
         return bus_load(rate_hz, LARGEST_FRAME_BYTES, bitrate=self.connection.bitrate, with_sync=self.sync)
+
+    def claims(self) -> tuple[str, ...]:
+        """The node."""
+        return (f"node {self.node_id} on {self.connection.interface}:{self.connection.channel}",)

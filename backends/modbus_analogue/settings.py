@@ -94,6 +94,10 @@ class ModbusForceSettings(ForceSensorSettings):
         """The force that a voltage stands for."""
         return (volts - self.zero_V) * self.sensitivity_uN_per_V
 
+    def claims(self) -> tuple[str, ...]:
+        """The port."""
+        return (f"port {self.connection.port}",)
+
 
 def _written(both: Range) -> str:
     return f"[{both.min:g}, {both.max:g}]"

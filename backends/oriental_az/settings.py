@@ -91,3 +91,7 @@ class AzZoomSettings(DeviceSettings):
     def register_order(self) -> RegisterOrder:
         """How the drive puts 32-bit values into registers."""
         return RegisterOrder(self.word_order, self.byte_order)
+
+    def claims(self) -> tuple[str, ...]:
+        """The port."""
+        return (f"port {self.connection.port}",)

@@ -126,6 +126,10 @@ class GcsStageSettings(DeviceSettings):
             )
         return self
 
+    def claims(self) -> tuple[str, ...]:
+        """The port."""
+        return (f"port {self.connection.port}",)
+
 
 def _check(travel: Range, resolution: float, tolerance: float, unit: str) -> None:
     if not travel.min < travel.max:

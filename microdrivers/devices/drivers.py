@@ -25,6 +25,10 @@ class DeviceSettings(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
+    def claims(self) -> tuple[str, ...]:
+        """What a device needs for itself alone, in words: a port, a node on a bus. A rig gives each to one device."""
+        return ()
+
 
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
 

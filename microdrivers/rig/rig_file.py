@@ -130,7 +130,7 @@ def load_rig_file(file: Path) -> RigDescription:
         raise_all(document, errors)
         raise AssertionError("unreachable: a rig that failed validation has errors")
     devices, errors = _load_devices(rig.devices, document)
-    errors += _check_roles(rig, devices, document)
+    errors += _check_roles(rig, devices, document) + _check_claims(devices, document)
     raise_all(document, errors)
     return RigDescription(file=file, rig=rig, devices=devices)
 
@@ -160,6 +160,22 @@ def _load_devices(sections: Mapping[str, Any], document: Document) -> tuple[dict
         if settings is not None:
             devices[name] = DeviceEntry(name, driver_name, driver, settings)
     return devices, errors
+
+
+def _check_claims(devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:
+    """A port or a node belongs to one device."""
+    owners: dict[str, str] = {}
+    errors = []
+    for name, entry in devices.items():
+        for claim in entry.settings.claims():
+            owner = owners.setdefault(claim, name)
+            if owner != name:
+                errors.append(
+                    document.error(
+                        f"{claim} already belongs to {owner!r}", ("devices", name), remedy="give each device its own"
+                    )
+                )
+    return errors
 
 
 def _check_roles(rig: RigFile, devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:

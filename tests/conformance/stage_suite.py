@@ -69,6 +69,7 @@ def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
         for sample in moving
     ]
     assert sum(within) >= 0.9 * len(within)
+    assert [sample.seq for sample in samples] == list(range(samples[0].seq, samples[0].seq + len(samples)))
     assert max(sample.dt_ns for sample in moving) <= 1_000_000
 
 
@@ -122,14 +123,22 @@ def is_on_target_only_when_it_is_there(bench: StageBench) -> None:
 
 @SUITE.check
 def a_stop_ends_the_motion_and_the_move(bench: StageBench) -> None:
-    move = bench.stage.start_move_to(**_near(bench, x_um=4500.0))
+    """All axes stop, each from a motion of its own."""
+    bench.stage.move_to(**_near(bench, y_um=-400.0, theta_deg=-0.5))
+    move = bench.stage.start_move_to(
+        **_near(bench, x_um=4500.0, y_um=200.0, theta_deg=0.5), speed_um_s=1400.0, theta_speed_deg_s=0.5
+    )
     bench.clock.sleep(0.3)
+    before = _truth(bench)
     bench.stage.stop()
     bench.clock.sleep(0.3)
     at_rest = _truth(bench)
     bench.clock.sleep(0.3)
     assert _truth(bench) == pytest.approx(at_rest, abs=0.01)
     assert at_rest["x"] < bench.home["x"] + 4000.0
+    assert at_rest["y"] < bench.home["y"] + 100.0
+    assert at_rest["theta"] < bench.home["theta"] + 0.4
+    assert all(at_rest[axis] >= before[axis] - 0.01 for axis in at_rest)
     with pytest.raises(MoveCancelled):
         move.wait()
     bench.stage.move_to(**_near(bench, x_um=100.0))

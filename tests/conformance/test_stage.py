@@ -7,6 +7,8 @@ import pytest
 
 from microdrivers.backends.pi_gcs.stage import GcsXYThetaStage
 from microdrivers.core.errors import MicrodriversError
+from microdrivers.fakes.pi_gcs.codes import ErrorCode
+from microdrivers.fakes.wire import wire_named
 from tests.conformance.bench import CHAINED, stage_bench
 from tests.conformance.stage_suite import SUITE
 
@@ -28,6 +30,14 @@ def test_opening_moves_nothing():
         start = [bench.truth(axis, 0) for axis in ("x", "y", "theta")]
         bench.clock.sleep(1.0)
         assert [bench.truth(axis, bench.clock.now_ns()) for axis in ("x", "y", "theta")] == start
+
+
+def test_closing_leaves_no_error_for_the_next_program():
+    with stage_bench() as bench:
+        controller = wire_named(bench.stage.name).emulator
+        bench.stage.stop()
+        assert controller.state.error is ErrorCode.STOPPED_BY_COMMAND
+    assert controller.state.error is ErrorCode.NONE
 
 
 class WrongSign(GcsXYThetaStage):
@@ -85,7 +95,19 @@ class LostReferenceIgnored(GcsXYThetaStage):
         return {"x": True, "y": True, "theta": True}
 
 
+class StopsOneAxisOnly(GcsXYThetaStage):
+    def _stop(self):
+        self._line.send_now(b"HLT 1\n")
+
+
+class NumbersNothing(GcsXYThetaStage):
+    def _next_seq(self):
+        return 0
+
+
 FOUND_BY = {
+    StopsOneAxisOnly: "a_stop_ends_the_motion_and_the_move",
+    NumbersNothing: "stamps_the_instant_of_the_pose",
     WrongSign: "moves_each_axis_its_own_way",
     SwappedAxes: "moves_each_axis_its_own_way",
     MillimetresForMicrometres: "moves_each_axis_its_own_way",

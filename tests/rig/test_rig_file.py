@@ -50,6 +50,22 @@ def test_the_optical_half_is_valid():
     assert description.as_data()["devices"]["zoom"]["backlash_steps"] == 20
 
 
+@pytest.mark.parametrize(
+    ("given", "twice", "message"),
+    [
+        ("/dev/ttyUSB1", "/dev/ttyUSB0", "port /dev/ttyUSB0 already belongs to 'sample_stage'"),
+        ("node_id: 14", "node_id: 11", "node 11 on socketcan:can0 already belongs to 'probe_stage'"),
+        ("node_id: 21", "node_id: 12", "node 12 on socketcan:can0 already belongs to 'probe_stage'"),
+        ("/dev/video2", "/dev/video1", "camera v4l2:///dev/video1 already belongs to 'camera_coarse'"),
+    ],
+)
+def test_nothing_belongs_to_two_devices(tmp_path, given, twice, message):
+    file = tmp_path / "lab.yaml"
+    file.write_text(shipped_rig().read_text(encoding="utf-8").replace(given, twice), encoding="utf-8")
+    with pytest.raises((ConfigError, ConfigErrors), match=message):
+        load_rig_file(file)
+
+
 MISTAKES = {
     "misspelt key": ("baudrate: 115200", "baudrat: 115200", "unknown key", "did you mean 'baudrate'"),
     "wrong unit in the key": (
