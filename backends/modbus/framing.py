@@ -23,7 +23,7 @@ class ReplyFinder(Protocol):
     """Looks for the reply to one request in what arrives.
 
     Attributes:
-        pdu: the reply or exception without its framing; empty until it is found.
+        pdu: the reply that is expected, or an exception (another length), without its framing; empty until it is found.
         start: where in the received bytes its frame begins.
         complaint: what is wrong with what arrived instead; empty if nothing is known to be.
         received: all that has arrived.
@@ -44,10 +44,12 @@ class Framing(Protocol):
     Attributes:
         gap_s: silence that the host keeps between a reply and its next request.
         description: for messages.
+        repeats: whether the same request always gives the same frame.
     """
 
     gap_s: float
     description: str
+    repeats: bool
 
     def frame(self, request: ModbusPDU) -> bytes:
         """The bytes to send."""

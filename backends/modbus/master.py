@@ -6,6 +6,7 @@ Requests and replies are built and decoded with pymodbus; waiting, time-outs and
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,13 +24,14 @@ from microdrivers.backends.modbus.framing import Expected, Framing, ReplyFinder
 from microdrivers.backends.modbus.mbap import MbapFraming
 from microdrivers.backends.modbus.rtu import Marks, RtuFraming, RtuTiming
 from microdrivers.backends.modbus.settings import ModbusConnection
-from microdrivers.core.errors import LinkTimeout, Moved, ProtocolError, RefusedError
+from microdrivers.core.errors import LinkTimeout, MicrodriversError, Moved, ProtocolError, RefusedError
 
 _WRITE_BLOCK = 0x10
 _WRITE_BLOCK_ECHO = 5
 
 _GATEWAY_SILENCE = 0x0B
 _MODEL = "check that the unit is the model that the rig file names"
+_OTHER_DEVICE = "; or another device is behind this port"
 _STATE = "check the device's settings and its state"
 _REFUSALS = {
     0x01: ("the function is not supported", _MODEL),
@@ -61,6 +63,15 @@ class Registers(NamedTuple):
     dt_ns: int
 
 
+class _Question(NamedTuple):
+    """A request and what must answer it; `frame` only where the same may be sent again and again."""
+
+    request: ModbusPDU
+    expected: Expected
+    what: str
+    frame: bytes = b""
+
+
 def framing_of(connection: ModbusConnection, rtu_timing: RtuTiming, marks: Marks | None = None) -> Framing:
     """The framing that a connection asks for; silences and marks of RTU are the device's."""
     return MbapFraming() if connection.framing == "tcp" else RtuFraming(connection, rtu_timing, marks)
@@ -81,10 +92,11 @@ class ModbusMaster:
         self.unit_id = unit_id
         self._line = line
         self._framing = framing
-        self._silence_remedy = silence_remedy
+        self._silence_remedy = f"{silence_remedy}{_OTHER_DEVICE}"
         self._decoder = DecodePDU(is_server=False)
         self._lock = threading.RLock()
         self._unsettled = False
+        self._questions: dict[tuple[type[ModbusPDU], int, int], _Question] = {}
         self._unit = f"unit {unit_id} on {line.connection.port} ({framing.description})"
 
     def read(self, address: int, count: int) -> Registers:
@@ -96,7 +108,7 @@ class ModbusMaster:
             ModbusRefusal: the device answered with an exception.
             LinkTimeout, ProtocolError: no sound reply, twice.
         """
-        return self._read(ReadHoldingRegistersRequest(address=address, count=count, dev_id=self.unit_id), "registers")
+        return self._read(ReadHoldingRegistersRequest, address, count, "registers")
 
     def read_input(self, address: int, count: int) -> Registers:
         """Read `count` input registers from `address` on (function 04h).
@@ -104,8 +116,7 @@ class ModbusMaster:
         Raises:
             ModbusRefusal, LinkTimeout, ProtocolError: as for `read`.
         """
-        request = ReadInputRegistersRequest(address=address, count=count, dev_id=self.unit_id)
-        return self._read(request, "input registers")
+        return self._read(ReadInputRegistersRequest, address, count, "input registers")
 
     def write(self, address: int, value: int) -> None:
         """Write one register (function 06h), once.
@@ -116,7 +127,7 @@ class ModbusMaster:
         request = self._write_request(address, (value,))
         echo = bytes((request.function_code,)) + request.encode()
         what = f"a write of {value:04X}h to register {address:04X}h"
-        self._exchange(request, Expected(echo, len(echo)), what, moved="maybe")
+        self._exchange(_Question(request, Expected(echo, len(echo)), what), moved="maybe")
 
     def write_block(self, address: int, values: Sequence[int]) -> None:
         """Write consecutive registers (function 10h), once.
@@ -127,7 +138,7 @@ class ModbusMaster:
         request = WriteMultipleRegistersRequest(address=address, registers=list(values), dev_id=self.unit_id)
         echo = bytes((_WRITE_BLOCK,)) + request.encode()[: _WRITE_BLOCK_ECHO - 1]
         what = f"a write of {len(values)} registers at {address:04X}h"
-        self._exchange(request, Expected(echo, _WRITE_BLOCK_ECHO), what, moved="maybe")
+        self._exchange(_Question(request, Expected(echo, _WRITE_BLOCK_ECHO), what), moved="maybe")
 
     def post(self, address: int, values: Sequence[int]) -> None:
         """Write one register or more as soon as the line is free, from any thread, without awaiting the reply."""
@@ -137,38 +148,49 @@ class ModbusMaster:
 
     # ------------------------------------------------------------------ inside
 
-    def _read(self, request: ModbusPDU, kind: str) -> Registers:
-        length = 2 * request.count
-        expected = Expected(bytes((request.function_code, length)), 2 + length)
-        what = f"a read of {request.count} {kind} at {request.address:04X}h"
+    def _read(self, kind: type[ModbusPDU], address: int, count: int, what: str) -> Registers:
+        question = self._questions.get((kind, address, count))
+        if question is None:
+            question = self._reading(kind, address, count, what)
+            self._questions[kind, address, count] = question
         try:
-            return self._read_once(request, expected, what)
+            return self._read_once(question)
         except (LinkTimeout, ProtocolError) as error:
             try:
-                return self._read_once(request, expected, what)
+                return self._read_once(question)
             except _NotSent:
                 raise error from None
+
+    def _reading(self, kind: type[ModbusPDU], address: int, count: int, what: str) -> _Question:
+        request = kind(address=address, count=count, dev_id=self.unit_id)
+        expected = Expected(bytes((request.function_code, 2 * count)), 2 + 2 * count)
+        frame = self._framing.frame(request) if self._framing.repeats else b""
+        return _Question(request, expected, f"a read of {count} {what} at {address:04X}h", frame)
 
     def _write_request(self, address: int, values: Sequence[int]) -> ModbusPDU:
         kind = WriteSingleRegisterRequest if len(values) == 1 else WriteMultipleRegistersRequest
         return kind(address=address, registers=list(values), dev_id=self.unit_id)
 
-    def _read_once(self, request: ModbusPDU, expected: Expected, what: str) -> Registers:
-        pdu, exchange, start = self._exchange(request, expected, what, moved="no")
-        earliest_ns, latest_ns = self._framing.sampled_within(exchange, start)
+    def _read_once(self, question: _Question) -> Registers:
+        reply, exchange = self._exchange(question, moved="no")
+        values = struct.unpack_from(f">{len(reply.pdu) // 2 - 1}H", reply.pdu, 2)
+        earliest_ns, latest_ns = self._framing.sampled_within(exchange, reply.start)
         half_ns = -(-(latest_ns - earliest_ns) // 2)
-        return Registers(tuple(pdu.registers), earliest_ns + half_ns, half_ns)
+        return Registers(values, earliest_ns + half_ns, half_ns)
 
-    def _exchange(
-        self, request: ModbusPDU, expected: Expected, what: str, *, moved: Moved
-    ) -> tuple[ModbusPDU, Exchange, int]:
+    def _exchange(self, question: _Question, *, moved: Moved) -> tuple[ReplyFinder, Exchange]:
+        """Ask, and find the reply that is expected."""
+        what = question.what
         with self._line.clock.transaction(), self._lock:  # its end may dispatch others that use this master
             try:
-                self._settle(what)
-                frame = self._framing.frame(request)
-                reply = self._framing.finder(frame, expected)
+                if self._unsettled:
+                    self._settle(what)
+                frame = question.frame or self._framing.frame(question.request)
+                reply = self._framing.finder(frame, question.expected)
                 exchange = self._line_exchange(frame, reply, what, moved)
-                return self._decoded(frame, reply, what, moved), exchange, reply.start
+                if len(reply.pdu) != question.expected.length:
+                    raise self._failure(frame, reply, what, moved)
+                return reply, exchange
             except ModbusRefusal:
                 raise
             except BaseException:
@@ -176,8 +198,6 @@ class ModbusMaster:
                 raise
 
     def _settle(self, what: str) -> None:
-        if not self._unsettled:
-            return
         self._unsettled = False  # first: a post that comes meanwhile must not be forgotten
         try:
             self._framing.settle(self._line, self.unit_id)
@@ -200,27 +220,26 @@ class ModbusMaster:
                 moved=moved,
             ) from error
 
-    def _decoded(self, frame: bytes, reply: ReplyFinder, what: str, moved: Moved) -> ModbusPDU:
+    def _failure(self, frame: bytes, reply: ReplyFinder, what: str, moved: Moved) -> MicrodriversError:
+        """What an exception means, or that there is no reply at all."""
         pdu = self._decoder.decode(reply.pdu) if reply.pdu else None
-        if pdu is None:
-            raise self._misfit(frame, reply, what, moved)
-        if not pdu.isError():
-            return pdu
+        if pdu is None or not pdu.isError():
+            return self._misfit(frame, reply, what, moved)
         code = pdu.exception_code
         passed = f"sent {frame.hex(' ')}, received {reply.received.hex(' ')}"
         if code in _REFUSALS:
             meaning, remedy = _REFUSALS[code]
-            raise ModbusRefusal(
+            return ModbusRefusal(
                 f"{self._unit} refused {what} with exception {code:02X}: {meaning}; {passed}",
                 remedy=remedy,
                 exception_code=code,
             )
         if code == _GATEWAY_SILENCE:
-            raise LinkTimeout(
+            return LinkTimeout(
                 f"the gateway got no answer to {what} from {self._unit}; {passed}",
                 remedy=self._silence_remedy, moved=moved,
             )  # fmt: skip
-        raise ProtocolError(
+        return ProtocolError(
             f"{self._unit}: unknown exception {code:02X} in reply to {what}",
             sent=frame, received=reply.received, remedy=_MODEL, moved=moved,
         )  # fmt: skip
@@ -230,5 +249,5 @@ class ModbusMaster:
             f"{self._unit}: {reply.complaint or 'undecodable reply'} in reply to {what}",
             sent=frame, received=reply.received, moved=moved,
             remedy="check that every unit on the line has its own id and that nobody else talks there; on a serial "
-            "line also parity, wiring and termination",
+            "line also parity, wiring and termination" + _OTHER_DEVICE,
         )  # fmt: skip

@@ -25,6 +25,7 @@ class MbapFraming:
 
     gap_s = 0.0
     description = "Modbus TCP"
+    repeats = False
 
     def __init__(self) -> None:
         self._framer = FramerSocket(DecodePDU(is_server=False))

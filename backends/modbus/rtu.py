@@ -5,6 +5,7 @@ Source: "MODBUS over Serial Line, Specification and Implementation Guide V1.02",
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -84,6 +85,8 @@ class RtuFraming:
     Args:
         marks: what the unit answers for certain; by default an echo.
     """
+
+    repeats = True
 
     def __init__(self, connection: SerialConnection, timing: RtuTiming, marks: Marks | None = None) -> None:
         self.gap_s = timing.gap_s
@@ -183,5 +186,6 @@ class RtuReply:
         )
 
 
+@functools.lru_cache(maxsize=256)  # a device that is polled says the same again most of the time
 def _is_sound(frame: bytes) -> bool:
     return FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big"))

@@ -7,6 +7,7 @@ values have 32 bits, an even address and the odd one behind it; both words go in
 from __future__ import annotations
 
 import enum
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -104,7 +105,7 @@ class AzDrive:
     def read_status(self) -> Status:
         """The output word."""
         reply = self._modbus.read(DRIVER_OUTPUT, 2)
-        return Status(Output(self._order.from_registers(*reply.values) & 0xFFFF), reply.t_ns)
+        return Status(_outputs(self._order, reply.values), reply.t_ns)
 
     def read_motion(self) -> Motion:
         """Command and feedback in one exchange."""
@@ -204,3 +205,8 @@ class AzDrive:
             f"{refusal.what}. No alarm is on; communication error {code:02X}h: {cause}",
             remedy="check speed, acceleration, current and curve in the rig file; close the maker's software",
         )
+
+
+@functools.lru_cache(maxsize=256)  # they change when a motion begins or ends
+def _outputs(order: RegisterOrder, registers: tuple[int, int]) -> Output:
+    return Output(order.from_registers(*registers) & 0xFFFF)

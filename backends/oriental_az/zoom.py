@@ -135,6 +135,8 @@ class AzZoomMotor(ZoomMotor):
             if self.clock.now_ns() >= deadline_ns:
                 raise self._drive.fault(code, moved="no", during="the alarm could not be reset: ")
             self.clock.sleep(_POLL_S)
+        with self._lock:
+            self._watch.see_status(self._drive.read_status())  # the last one still tells of the alarm
         self._alarm_code = 0
 
     # ------------------------------------------------------------------ reading

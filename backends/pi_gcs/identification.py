@@ -84,7 +84,8 @@ def _identify(gcs: Gcs, settings: GcsStageSettings, wanted_serial_number: str | 
     except (LinkTimeout, ProtocolError) as error:
         baud = (
             f"check power, cable and baud rate: a wrong rate looks like garbage or silence; the rig file says "
-            f"{baudrate}, the controller's DIP switches or parameters say which it uses"
+            f"{baudrate}, the controller's DIP switches or parameters say which it uses; "
+            "or another device is behind this port"
         )
         special = isinstance(error, ProtocolError) and error.remedy != UNINTELLIGIBLE_REMEDY
         error.remedy = f"{error.remedy}; {baud}" if special else baud

@@ -53,12 +53,14 @@ class MjpegServer:
         clock: Clock,
         bind: str = "127.0.0.1",
         port: int = 0,
+        host: str | None = None,
     ) -> None:
         if clock.simulated:
             raise UnsupportedError("a stream for other programs needs real time", remedy="serve on the system clock")
         self._name = name
         self._clock = clock
         self._bind = bind
+        self._host = bind if host is None else host
         self._port = port
         self._http: ThreadingHTTPServer | None = None
         self._thread: Timer | None = None
@@ -68,7 +70,7 @@ class MjpegServer:
     @property
     def url(self) -> str:
         """Where a camera's driver finds the stream."""
-        host = f"[{self._bind}]" if ":" in self._bind else self._bind
+        host = f"[{self._host}]" if ":" in self._host else self._host
         return f"mjpeg+http://{host}:{self._port}/{self._name}"
 
     def plug_in(self) -> None:

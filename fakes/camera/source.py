@@ -46,7 +46,7 @@ def attach(request: EmulationRequest) -> Emulation:
 def _serve(name: str, source: FakeFrameSource, settings: CameraSettings, request: ServeRequest) -> Endpoint:
     from microdrivers.fakes.camera.mjpeg_server import MjpegServer
 
-    server = MjpegServer(name, source, settings, clock=source.clock, bind=request.bind)
+    server = MjpegServer(name, source, settings, clock=source.clock, bind=request.bind, host=request.host)
     return Endpoint(overrides={"source": server.url}, where=server.url, close=server.close, control=server)
 
 

@@ -167,7 +167,7 @@ def _open_port(link: str, wire: Wire, request: ServeRequest) -> tuple[HostPort, 
     if request.transport == "pty":
         return PtyPort(request.folder / link), str(request.folder / link)
     port = TcpPort(request.bind, wire.connect)
-    return port, f"socket://{port.address[0]}:{port.address[1]}"
+    return port, f"socket://{request.host}:{port.address[1]}"
 
 
 def _overrides(

@@ -282,6 +282,6 @@ def _serve_on_pty(name: str, wire: Wire, clock: Clock, request: ServeRequest) ->
 def _serve_on_tcp(name: str, wire: Wire, clock: Clock, request: ServeRequest) -> Endpoint:
     port = TcpPort(request.bind, wire.connect)
     bridge = Bridge(wire, clock, port, name=name, tap=request.tap)
-    url = f"socket://{port.address[0]}:{port.address[1]}"
+    url = f"socket://{request.host}:{port.address[1]}"
     overrides = {"connection": {"port": url}}
     return Endpoint(overrides=overrides, where=url, close=bridge.close, control=Cable(wire, port, bridge))

@@ -49,7 +49,7 @@ def optics(
     wire_log: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Calibrate camera to stage on line while the zoom changes (Bilen et al., section III.B).
+    """Calibrate camera to stage on line while the zoom changes (Bilen et al., section III.B).
 
     A target on the sample stage moves on a circle; one of its points is tracked at frame rate and the projection
     matrix is estimated by recursive least squares, through a change of zoom. Writes result.json, calibration.yaml

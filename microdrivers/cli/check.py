@@ -10,7 +10,7 @@ import click
 @click.command(short_help="Validate a rig file without touching hardware.")
 @click.argument("rig", type=click.Path(path_type=Path))
 def check(rig: Path) -> None:
-    r"""Validate the rig file RIG completely, without touching hardware.
+    """Validate the rig file RIG completely, without touching hardware.
 
     Every mistake is listed with file, line, column and what to do. Exit status 0 if there is none.
 

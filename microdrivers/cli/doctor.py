@@ -29,7 +29,7 @@ _INDENT = " " * 11
 @click.option("--yes", is_flag=True, help="Do not ask whether the way is free.")
 @click.option("--json", "as_json", is_flag=True, help="Print findings and figures as JSON.")
 def doctor(choice: RigChoice, motion: bool, yes: bool, as_json: bool) -> None:
-    r"""Examine every device of the rig file RIG, say what is wrong and what to try. Nothing moves without --motion.
+    """Examine every device of the rig file RIG, say what is wrong and what to try. Nothing moves without --motion.
 
     Each device is opened by itself, so that one failure does not hide the others. Measured: the time of 20 reads,
     the rate of one second's stream, how well the time of a sample is known; of a camera also lost frames, saturation,
@@ -57,10 +57,11 @@ def doctor(choice: RigChoice, motion: bool, yes: bool, as_json: bool) -> None:
         if motion and not (yes or rig.fake):
             _ask_for_the_way(rig)
         diagnosis = diagnose(rig, motion=motion, progress=progress)
+        where = _where(choice, emulated=rig.file.emulated)
     if as_json:
         click.echo(msgspec.json.format(msgspec.json.encode(diagnosis), indent=2).decode())
     else:
-        for line in _lines(diagnosis, _where(choice)):
+        for line in _lines(diagnosis, where):
             click.echo(line)
     if diagnosis.count("problem"):
         sys.exit(EXIT_ERROR)
@@ -76,10 +77,12 @@ def _ask_for_the_way(rig: Rig) -> None:
         click.confirm(what, abort=True, err=True)
 
 
-def _where(choice: RigChoice) -> str:
+def _where(choice: RigChoice, *, emulated: bool) -> str:
     if choice.wire_replay is not None:
         return f"replayed from {choice.wire_replay}"
-    return "emulated, simulated clock" if choice.fake else "hardware"
+    if choice.fake:
+        return "emulated, simulated clock"
+    return "emulated, on ports" if emulated else "hardware"
 
 
 def _lines(diagnosis: Diagnosis, where: str) -> Iterator[str]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import signal
+import stat
 from types import FrameType
 from typing import Any
 
@@ -39,7 +42,7 @@ class CommandLine(click.Group):
 @click.version_option(__version__, "-V", "--version")
 @click.option("--debug", is_flag=True, help="Show tracebacks and debug messages.")
 def main(debug: bool) -> None:
-    r"""Run, check and calibrate a micromanipulation rig described in one YAML file.
+    """Run, check and calibrate a micromanipulation rig described in one YAML file.
 
     \b
     Examples:
@@ -55,6 +58,8 @@ def main(debug: bool) -> None:
     # Also where a shell has started us with SIGINT ignored: whoever drives stages must be stoppable.
     signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _interrupt)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup asks to go on
+        signal.signal(signal.SIGHUP, _hang_up)
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:
@@ -62,6 +67,18 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
     from microdrivers.core.clock.interruption import INTERRUPTION
 
     INTERRUPTION.request()
+
+
+def _hang_up(number: int, frame: FrameType | None) -> None:
+    """The terminal is gone, or the ssh session dropped: as Ctrl-C, and what is still said must not fail."""
+    signal.signal(number, lambda _number, _frame: None)  # shell and system may both tell: that is one request
+    silent = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in (1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode):
+                os.dup2(silent, descriptor)
+    os.close(silent)
+    _interrupt(number, frame)
 
 
 def _add(group: click.Group, name: str, module: str, attribute: str, short_help: str) -> None:
@@ -102,5 +119,6 @@ _add(main, "doctor", "microdrivers.cli.doctor", "doctor", "Examine every device:
 _add(main, "reference", "microdrivers.cli.reference", "reference", "Find the reference of a stage or zoom (moves!).")
 _add(main, "move", "microdrivers.cli.move", "move", "Move a stage or the zoom, and wait until settled.")
 _add(main, "stop", "microdrivers.cli.stop", "stop", "Stop everything that moves, now.")
+_add(main, "clear-fault", "microdrivers.cli.clear_fault", "clear_fault", "Clear a device's fault, its cause removed.")
 _add(main, "serve", "microdrivers.cli.serve", "serve", "Put every emulator of a rig on a port for other programs.")
 _add(main, "snap", "microdrivers.cli.snap", "snap", "Take one fresh frame and write it to a file.")

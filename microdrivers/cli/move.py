@@ -31,7 +31,7 @@ _ZOOM_OPTIONS = ("zoom",)
 @click.option("--theta-speed-deg-s", type=float, help="Speed of θ; default: as fast as the axis allows.")
 @click.option("--retract", is_flag=True, help="Take a fine stage's tool away from the sample, as the rig file says.")
 def move(choice: RigChoice, device: str, relative: bool, retract: bool, **options: float | None) -> None:
-    r"""Move DEVICE of the rig file RIG, wait until it has settled and print where it was observed to be.
+    """Move DEVICE of the rig file RIG, wait until it has settled and print where it was observed to be.
 
     The move is checked before anything moves: finite, inside the limits, axes referenced, speed possible; nothing is
     clipped. Ctrl-C stops the device. A failed move is stopped and never repeated. Only DEVICE is opened. An emulated

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.option("--device", help="Which stage or zoom; default: the microscope's sample stage.")
 @click.option("--yes", is_flag=True, help="Do not ask whether the way is free.")
 def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool) -> None:
-    r"""Find the reference of a stage or the zoom of the rig file RIG. IT MOVES to its reference switches.
+    """Find the reference of a stage or the zoom of the rig file RIG. IT MOVES to its reference switches.
 
     Asks first whether the way is free. Ctrl-C stops the device. Only that device is opened.
 

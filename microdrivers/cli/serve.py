@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 from microdrivers.cli.rig_options import WIRE_LOG_HELP
+
+if TYPE_CHECKING:
+    from microdrivers.rig.serving import ServedRig
+
+_LONGEST_S = 1e9
+
+
+def _finite(_context: click.Context, _parameter: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):
+        raise click.BadParameter(f"{value:g} is no number of seconds")
+    return value
 
 
 @click.command(short_help="Put every emulator of a rig on a port for other programs.")
@@ -21,11 +33,15 @@ from microdrivers.cli.rig_options import WIRE_LOG_HELP
     "--can", "can_interface", metavar="NAME", help="SocketCAN interface for CAN, as vcan0; default: a serial adapter."
 )
 @click.option(
-    "--write", "served", type=click.Path(path_type=Path), help="Write a rig file that points at the endpoints."
+    "--write",
+    "served",
+    type=click.Path(path_type=Path),
+    help="Write a rig file that points at the endpoints; only one that serve wrote is overwritten.",
 )
 @click.option(
-    "--for", "duration_s", type=click.FloatRange(min=0), help="End after so many seconds; default: at Ctrl-C."
-)
+    "--for", "duration_s", type=click.FloatRange(0, _LONGEST_S), callback=_finite, metavar="SECONDS",
+    help="End after so many seconds; default: at Ctrl-C.",
+)  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option(
@@ -44,7 +60,7 @@ def serve(
     wire_log: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Emulate the rig file RIG in real time and let other programs use it.
+    """Emulate the rig file RIG in real time and let other programs use it.
 
     Serial devices appear on pseudo-terminals or TCP ports, CAN buses behind a serial adapter (slcan) or on a SocketCAN
     interface, cameras as HTTP streams. Other machines are not let in unless --bind says so.
@@ -55,9 +71,11 @@ def serve(
       microdrivers calibrate optics --rig served.yaml      in another terminal
     """
     from microdrivers.rig import load_rig_file
-    from microdrivers.rig.serving import ServedRig
+    from microdrivers.rig.serving import ServedRig, check_writable
 
     description = load_rig_file(rig)
+    if served is not None:
+        check_writable(served, description)
     with ServedRig(
         description,
         seed=seed,
@@ -67,22 +85,26 @@ def serve(
         can_interface=can_interface,
         wire_log=wire_log,
     ) as running:
-        if served is not None:
-            running.write(served)
-        where = {name: endpoint.where for name, endpoint in running.endpoints.items()}
-        if as_json:
-            click.echo(json.dumps(where))
-        else:
-            width = max(map(len, where))
-            for name, place in where.items():
-                click.echo(f"{name:<{width}}  {place}")
-            if served is not None:
-                click.echo(f"rig file: {served}")
-            click.echo("serving; Ctrl-C ends it" if duration_s is None else f"serving for {duration_s:g} s")
         try:
+            if served is not None:
+                running.write(served)
+            _announce(running, served, duration_s, as_json)
             if duration_s is not None:
                 running.clock.sleep(duration_s)
             while duration_s is None:
                 running.clock.sleep(3600.0)
         except KeyboardInterrupt:
             click.echo("stopped", err=True)
+
+
+def _announce(running: ServedRig, served: Path | None, duration_s: float | None, as_json: bool) -> None:
+    where = {name: endpoint.where for name, endpoint in running.endpoints.items()}
+    if as_json:
+        click.echo(json.dumps(where))
+        return
+    width = max(map(len, where))
+    for name, place in where.items():
+        click.echo(f"{name:<{width}}  {place}")
+    if served is not None:
+        click.echo(f"rig file: {served}")
+    click.echo("serving; Ctrl-C ends it" if duration_s is None else f"serving for {duration_s:g} s")

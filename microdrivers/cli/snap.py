@@ -27,7 +27,7 @@ _RATE_SHARE = 0.99
 @click.option("--exposure-ms", type=float, help="Exposure time; default: the rig file's.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 def snap(choice: RigChoice, camera: str | None, out: Path, exposure_ms: float | None, force: bool) -> None:
-    r"""Take one frame with CAMERA of the rig file RIG, exposed after the command, and write it with its bit depth.
+    """Take one frame with CAMERA of the rig file RIG, exposed after the command, and write it with its bit depth.
 
     CAMERA may be left out if the rig has a microscope or one camera only. Only the camera is opened. An exposure that
     does not fit the rig file's frame rate lowers the rate.

@@ -12,6 +12,8 @@ from microdrivers.cli.main import EXIT_ERROR
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from microdrivers.devices.base import Device
 
 
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 @rig_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of lines.")
 def status(choice: RigChoice, as_json: bool) -> None:
-    r"""Show each device of the rig file RIG: identification, link and state. Nothing moves.
+    """Show each device of the rig file RIG: identification, link and state. Nothing moves.
 
     A device that cannot be opened is shown with its error, and so are all others. Exit status 0 if every device
     answers, else 1. Emulated devices (--fake) are as they are right after power-on.
@@ -33,9 +35,10 @@ def status(choice: RigChoice, as_json: bool) -> None:
     import msgspec
 
     with closing(choice.build()) as rig:
-        found = {name: _ask(device) for name, device in rig.devices.items()}
+        found = {name: _ask(device, choice.file) for name, device in rig.devices.items()}
         if as_json:
-            document = {"rig": rig.file.name, "file": str(choice.file), "fake": rig.fake, "devices": found}
+            fake = rig.fake or rig.file.emulated
+            document = {"rig": rig.file.name, "file": str(choice.file), "fake": fake, "devices": found}
             click.echo(msgspec.json.format(msgspec.json.encode(document), indent=2).decode())
         else:
             width = max(map(len, found))
@@ -45,16 +48,17 @@ def status(choice: RigChoice, as_json: bool) -> None:
         sys.exit(EXIT_ERROR)
 
 
-def _ask(device: Device[Any]) -> dict[str, Any]:
+def _ask(device: Device[Any], file: Path) -> dict[str, Any]:
     """What the device says of itself; `error` is None if it answered."""
     import msgspec
 
     from microdrivers.core.errors import MicrodriversError
     from microdrivers.devices.camera import Camera
-    from microdrivers.routines.device_state import identity_text, state_data, state_text
+    from microdrivers.routines.device_state import fault_remedy, identity_text, state_data, state_text
 
     entry: dict[str, Any] = {
-        "identity": None, "info": None, "link": "closed", "state": None, "text": "", "fault": None, "error": None,
+        "identity": None, "info": None, "link": "closed", "state": None, "text": "", "fault": None, "fault_remedy": "",
+        "error": None,
     }  # fmt: skip
     try:
         device.open()
@@ -62,9 +66,11 @@ def _ask(device: Device[Any]) -> dict[str, Any]:
         sample = None if isinstance(device, Camera) else device.read()
         entry |= {"state": state_data(device, sample), "text": state_text(device, sample)}
     except MicrodriversError as error:
-        entry["error"] = {"kind": type(error).__name__, "what": error.what, "remedy": error.remedy}
+        remedy = fault_remedy(error, file, device.name) if device.link == "open" else error.remedy
+        entry["error"] = {"kind": type(error).__name__, "what": error.what, "remedy": remedy}
     entry["link"] = device.link
-    entry["fault"] = device.fault.what if device.fault is not None else None
+    if device.fault is not None:
+        entry |= {"fault": device.fault.what, "fault_remedy": fault_remedy(device.fault, file, device.name)}
     return entry
 
 
@@ -74,5 +80,6 @@ def _line(entry: dict[str, Any]) -> str:
     if error is not None:
         remedy = f" (to do: {error['remedy']})" if error["remedy"] else ""
         return f"{who}link {entry['link']} | {click.style('ERROR', fg='red', bold=True)}: {error['what']}{remedy}"
-    failure = f" | {click.style('FAULT', fg='red', bold=True)}: {fault}" if fault else ""
+    remedy = f" (to do: {entry['fault_remedy']})" if entry["fault_remedy"] else ""
+    failure = f" | {click.style('FAULT', fg='red', bold=True)}: {fault}{remedy}" if fault else ""
     return f"{who}link {entry['link']} | {entry['text']}{failure}"

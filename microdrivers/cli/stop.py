@@ -13,7 +13,9 @@ from microdrivers.cli.main import EXIT_ERROR
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:
-    from microdrivers.core.errors import MicrodriversError
+    from pathlib import Path
+
+    from microdrivers.core.errors import ConfigError, MicrodriversError
     from microdrivers.devices.base import Device
     from microdrivers.rig import Rig
 
@@ -32,7 +34,7 @@ class _Told(NamedTuple):
 @click.command(short_help="Stop everything that moves, now.")
 @rig_options
 def stop(choice: RigChoice) -> None:
-    r"""Tell every device of the rig file RIG that can move to stop, each as soon as it can be reached.
+    """Tell every device of the rig file RIG that can move to stop, each as soon as it can be reached.
 
     All are reached for at once; none waits for another. What was told to stop is then watched until it stands still.
     Exit status 0 if everything was reached and stands still, else 1: use the emergency stop then.
@@ -47,7 +49,8 @@ def stop(choice: RigChoice) -> None:
     from microdrivers.devices.camera import Camera
     from microdrivers.devices.force_sensor import ForceSensor
 
-    with closing(choice.build()) as rig:
+    with closing(choice._replace(wire_log=None).build()) as rig:
+        not_logged = _log_wires(rig, choice.wire_log)
         moving = [device for device in rig.devices.values() if not isinstance(device, Camera | ForceSensor)]
         told = _tell_all(rig, moving)
         width = max(map(len, rig.devices))
@@ -58,7 +61,22 @@ def stop(choice: RigChoice) -> None:
             click.echo(f"{device.name:<{width}}  {text}")
     if failed:
         click.echo("not everything is known to stand still: use the emergency stop", err=True)
+    if not_logged is not None:
+        click.echo(f"there is no wire log of this: {not_logged}", err=True)
+    if failed or not_logged is not None:
         sys.exit(EXIT_ERROR)
+
+
+def _log_wires(rig: Rig, file: Path | None) -> ConfigError | None:
+    """Log to that file if one is wanted; why that cannot be must not keep anybody from stopping."""
+    from microdrivers.core.errors import ConfigError
+
+    try:
+        if file is not None:
+            rig.log_wires(file)
+    except ConfigError as error:
+        return error
+    return None
 
 
 def _tell_all(rig: Rig, devices: list[Device[Any]]) -> list[_Told]:
@@ -84,11 +102,16 @@ def _tell(device: Device[Any]) -> _Told:
 
 
 def _failed(sent: bool, error: MicrodriversError) -> str:
-    outcome = "told to stop, but WHO LISTENS IS NOT KNOWN" if sent else "NOT REACHED"
-    lines = [f"{click.style(outcome, fg='red', bold=True)}: {error.what}"]
-    if error.remedy:
-        lines.append(f"    to do: {error.remedy}; if another program holds the port, interrupt that program")
-    return "\n".join(lines)
+    from microdrivers.core.errors import LinkLost
+
+    outcome = "NOT REACHED"
+    if sent:
+        # A TCP port in use takes a second connection, and what is sent there, and hangs up.
+        hung_up = isinstance(error, LinkLost)
+        outcome = "PROBABLY NOT REACHED" if hung_up else "told to stop, but WHO LISTENS IS NOT KNOWN"
+    first = "    to do: another program may hold the port, interrupt that program"
+    remedy = f"; else {error.remedy}" if error.remedy else ""
+    return f"{click.style(outcome, fg='red', bold=True)}: {error.what}\n{first}{remedy}"
 
 
 def _watch(device: Device[Any]) -> tuple[str, bool]:

@@ -7,6 +7,7 @@ framework names none of them; a third party's package adds its own. See docs/dec
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -125,6 +126,29 @@ class ServeRequest:
     tap: WireTap | None = None
     can: Literal["slcan", "socketcan"] = "slcan"
     can_channel: str = "vcan0"
+
+    @property
+    def host(self) -> str:
+        """The name or address by which a port bound to `bind` is reached; a wildcard is none, so this machine's own."""
+        if self.bind not in ("", "0.0.0.0", "::"):
+            return self.bind
+        name = socket.gethostname()
+        try:
+            socket.getaddrinfo(name, None)
+        except OSError:
+            return _own_address()
+        return name
+
+
+def _own_address() -> str:
+    """The address from which this machine would speak to others; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # reserved for documentation (RFC 5737)
+        except OSError:
+            return "127.0.0.1"
+        address: str = probe.getsockname()[0]
+        return address
 
 
 @dataclass(frozen=True)

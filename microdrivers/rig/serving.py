@@ -2,22 +2,61 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import yaml
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SystemClock
-from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.devices.drivers import Endpoint, ServeRequest
 from microdrivers.devices.wire_tap import WireTap
 from microdrivers.recording.wire_log import WireLogWriter, describe_source
 from microdrivers.rig.rig_file import RigDescription
 from microdrivers.rig.simulation import Simulation, merge_settings
+
+_MARK = "served on the endpoints below for as long as the serving process runs."
+"""In the first line of every rig file written here: only such a file is overwritten."""
+
+
+def check_writable(file: Path, served: RigDescription) -> None:
+    """Whether a rig file that points at endpoints may be written there; nothing is.
+
+    Raises:
+        ConfigError: it is the served rig file itself, or a file that was not written here; or there is no such folder.
+    """
+    if not file.exists():
+        folder = file.parent
+        if not (folder.is_dir() and os.access(folder, os.W_OK)):
+            _refuse(file, "the folder does not exist or may not be written", remedy="choose another file, or make it")
+        return
+    if served.file.exists() and file.samefile(served.file):
+        _refuse(file, "this is the rig file that is to be served")
+    if not _written_here(file):
+        _refuse(file, "the file exists and was not written by `microdrivers serve`")
+    if not os.access(file, os.W_OK):
+        _refuse(file, "the file may not be written")
+
+
+def _refuse(file: Path, what: str, *, remedy: str = "choose another name for the file to write") -> NoReturn:
+    raise ConfigError(what, file=str(file), remedy=remedy)
+
+
+def _written_here(file: Path) -> bool:
+    if not file.is_file():
+        return False
+    try:
+        text = file.read_text(encoding="utf-8")
+        data = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return False
+    first = text.partition("\n")[0]
+    return first.startswith("#") and first.endswith(_MARK) and isinstance(data, dict) and data.get("emulated") is True
 
 
 class ServedRig:
@@ -79,11 +118,20 @@ class ServedRig:
         return data
 
     def write(self, file: Path) -> None:
-        """Write a rig file that points at the endpoints."""
-        header = (
-            f"# {self.description.rig.name}, served on the endpoints below for as long as the serving process runs.\n"
-        )
-        file.write_text(header + yaml.safe_dump(self.rig_data(), sort_keys=False, allow_unicode=True), encoding="utf-8")
+        """Write a rig file that points at the endpoints.
+
+        Raises:
+            ConfigError: it may not be written there, see `check_writable`, or cannot be.
+        """
+        check_writable(file, self.description)
+        header = f"# {self.description.rig.name}, {_MARK}\n"
+        text = header + yaml.safe_dump(self.rig_data(), sort_keys=False, allow_unicode=True)
+        try:
+            file.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(
+                f"the rig file cannot be written there: {error.strerror}", file=str(file), remedy="choose another file"
+            ) from error
 
     def close(self) -> None:
         """End all endpoints and emulators; idempotent."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.samples import ForceSample, PoseSample, Sample, ZoomSample
 from microdrivers.devices.base import Device, DeviceInfo
 from microdrivers.devices.camera import Camera
@@ -29,6 +31,13 @@ def unreferenced_axes(device: Device[Any]) -> list[str]:
     if not isinstance(device, Stage):
         return []
     return [axis for axis, known in device.referenced.items() if not known]
+
+
+def fault_remedy(error: MicrodriversError, file: Path, device: str) -> str:
+    """What to do about a fault of a device that answers, with the command that clears it where it can be cleared."""
+    if "clear_fault()" not in error.remedy:
+        return error.remedy
+    return f"{error.remedy}; to clear it: microdrivers clear-fault {file} {device}"
 
 
 def state_text(device: Device[Any], sample: Sample | None) -> str:

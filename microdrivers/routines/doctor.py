@@ -16,7 +16,7 @@ from microdrivers.devices.stage import Stage
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
 from microdrivers.routines.camera_check import LEAST_RATE_SHARE, RATE_TIME_S, STAMP_LIMIT_NS, check_camera
-from microdrivers.routines.device_state import identity_text, state_text, unreferenced_axes
+from microdrivers.routines.device_state import fault_remedy, identity_text, state_text, unreferenced_axes
 from microdrivers.routines.findings import DeviceDiagnosis, Diagnosis
 from microdrivers.routines.progress import Progress
 
@@ -55,7 +55,7 @@ def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None
             emulated rig, which knows no reference after its power-on, the axes are referenced first.
         progress: told which device is being examined.
     """
-    diagnoses = []
+    diagnoses, file = [], rig.description.file
     for name, device in rig.devices.items():
         if progress is not None:
             progress.step(f"examining {name}")
@@ -73,11 +73,11 @@ def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None
         except MicrodriversError as error:
             found.failed(error)
         if device.fault is not None:
-            found.problem(f"the device is at fault: {device.fault.what}", device.fault.remedy)
+            found.problem(f"the device is at fault: {device.fault.what}", fault_remedy(device.fault, file, name))
     return Diagnosis(
         rig=rig.file.name,
         file=str(rig.description.file),
-        fake=rig.fake,
+        fake=rig.fake or rig.file.emulated,
         clock="simulated" if rig.clock.simulated else "system",
         devices=diagnoses,
     )

@@ -72,7 +72,8 @@ def test_a_cut_reply_fails_again_in_the_replay(run, tmp_path):
     run("status", RIG, "--fake", "--wire-log", "wire.jsonl")
     log = tmp_path / "wire.jsonl"
     lines = log.read_text(encoding="utf-8").splitlines(keepends=True)
-    end = max(number for number, line in enumerate(lines) if '"sample_stage", "direction": "received"' in line)
+    stop = next(number for number, line in enumerate(lines) if "u0018" in line)
+    end = max(n for n, line in enumerate(lines[:stop]) if '"sample_stage", "direction": "received"' in line)
     log.write_text("".join(lines[:end] + lines[end + 1 :]), encoding="utf-8")
     result = run("status", RIG, "--wire-replay", "wire.jsonl")
     assert result.exit_code == 1

@@ -121,14 +121,14 @@ def test_fast_polls_read_a_conversion_twice(rigs: list[Rig]) -> None:
 def test_a_tip_that_is_pressed_against_the_obstacle_is_felt(rigs: list[Rig]) -> None:
     clock = SimulatedClock()
     axis = {"travel_um": [-625, 625]}
-    section = {**SECTION, "axis": [1, 0, 0], "stiffness_uN_per_um": 1000.0}
+    section = {**SECTION, "axis": [0, 0, 1], "stiffness_uN_per_um": 1000.0}
     devices = {"gripper_stage": {"axes": {"x": axis, "y": axis, "z": axis}}, NAME: section}
     settings = WorldSettings(force=ForceWorld(noise_uN_per_sqrt_Hz={NAME: 0.0}, drift_uN_per_min=0, zero_spread_uN=0))
     request = WorldRequest(settings=settings, rig={"devices": devices}, seed=1, clock=clock, bus=Bus())
     world = MicroscopeWorld(request)
     rigs.append(Rig(world))
     assert rigs[0].reading() == 2500
-    tip = world.fine_stage_axes["gripper_stage"]["x"]
+    tip = world.fine_stage_axes["gripper_stage"]["z"]
     end_ns = tip.move(rigs[0].clock.now_ns(), -201.0, speed=1000.0, acceleration=1e5)
     rigs[0].clock.sleep((end_ns - rigs[0].clock.now_ns()) / NS_PER_S + 0.1)
     assert rigs[0].reading() == pytest.approx(2500 + 1000 / 50 / (1 / 50 + 1 / 1000), abs=1)

@@ -163,9 +163,16 @@ def edit(file, change):
 
 
 def last_reply(file, device):
-    """The last record that was received from a device."""
-    lines = file.read_text(encoding="utf-8").splitlines()
-    return [json.loads(line) for line in lines if f'"{device}", "direction": "received"' in line][-1]
+    """The last record that was received from a device before what is sent and asked at closing."""
+    records = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    own = [record for record in records if record.get("device") == device and "direction" in record]
+    stop = next(n for n, record in enumerate(own) if record["direction"] == "sent" and is_stop(record))
+    return [record for record in own[:stop] if record["direction"] == "received"][-1]
+
+
+def is_stop(record):
+    """#24 of GCS, or the input word of the AZ drive with STOP on."""
+    return record.get("text") == "\x18" or record.get("hex", "").startswith("01 06 00 7D 00 20")
 
 
 def test_a_rig_reads_from_its_log_what_it_read_when_the_log_was_taken(recorded, caplog):

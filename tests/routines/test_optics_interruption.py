@@ -5,6 +5,7 @@ from contextlib import suppress
 import pytest
 
 from microdrivers.core.errors import IllConditioned, LinkError
+from microdrivers.estimators.optics import student_factor
 from microdrivers.fakes.wire import Wire, wire_named
 
 
@@ -42,6 +43,49 @@ def test_ctrl_c_on_the_circle_stops_all_axes_and_keeps_what_was_measured(calibra
     assert not calibration.result.complete
     assert frame - 3 <= calibration.result.frames <= frame + 1
     assert any("interrupted" in note for note in calibration.result.notes)
+
+
+OLD_ZOOM, NEW_ZOOM = 0.9, 1.2
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize(
+    ("frame", "zoom"), [(47, OLD_ZOOM), (49, OLD_ZOOM), (51, OLD_ZOOM), (54, OLD_ZOOM), (58, NEW_ZOOM)]
+)
+def test_ctrl_c_soon_after_the_zoom_change_keeps_the_calibration_that_is_well_founded(calibrate, frame, zoom, seed):
+    """The zoom changes after frame 45; fewer than 57 frames are refused beforehand, so no interruption may use them."""
+    calibration = calibrate(seed=seed, progress=InterruptAt(frame))
+    result, truth = calibration.result, calibration.truth
+    assert not result.complete
+    assert result.zoom == result.valid_for.zoom == pytest.approx(zoom, rel=1e-3)
+    assert truth.zoom == pytest.approx(zoom, rel=5e-3)
+    half_width = student_factor(result.degrees_of_freedom) * result.scale_sigma_px_per_um
+    assert abs(result.scale_px_per_um - truth.scale_px_per_um) <= half_width
+    low, high = result.tilt.interval_deg
+    assert low <= truth.tilt_deg <= high
+    since = sum(estimate.frame_index > 44 for estimate in calibration.run.estimates)
+    ended = [note for note in result.notes if f"ended {since} frames after the zoom began to change" in note]
+    assert bool(ended) == (zoom == OLD_ZOOM)
+    assert (result.zoom_change is None) == (zoom == OLD_ZOOM)
+
+
+def test_ctrl_c_before_either_zoom_is_measured_well_enough_says_what_is_missing(calibrate):
+    with pytest.raises(IllConditioned) as caught:
+        calibrate(progress=InterruptAt(8), change_after_frame=3)
+    assert "9 are needed" in caught.value.what
+    assert "inf" not in str(caught.value)
+
+
+def test_ctrl_c_at_rest_keeps_the_old_zoom_too(calibrate):
+    """Between two frames at rest the zoom comes and goes unseen."""
+    result = calibrate(progress=InterruptAt(20), settled=True, change_after_frame=14).result
+    assert result.valid_for.zoom == pytest.approx(OLD_ZOOM, rel=1e-3)
+    assert any("too few for the new zoom (5 frames with the zoom at rest" in note for note in result.notes)
+
+
+def test_too_short_an_arc_is_no_calibration(calibrate):
+    with pytest.raises(IllConditioned, match="too short an arc"):
+        calibrate(progress=InterruptAt(14), degrees_per_frame=1.0)
 
 
 @pytest.mark.parametrize("write", [40, 90, 150, 230, 333, 480, 620])

@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from microdrivers.core.errors import IllConditioned
 from microdrivers.core.inbox import EstimatorHost
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
 from microdrivers.core.units import NS_PER_S
-from microdrivers.estimators.optics import OpticalParameters, optical_parameters, student_factor
 from microdrivers.estimators.optics.calibrator import CalibratorSettings, OpticsCalibrator, PointTracker
 from microdrivers.results.optics import (
     OpticsResult,
@@ -25,13 +23,9 @@ from microdrivers.results.optics import (
     ZoomChange,
     iterations_to_settle,
 )
+from microdrivers.routines.optics.choice import Choice, begins_change, choose_estimate
 from microdrivers.routines.optics.source import Optics, OpticsSource
 from microdrivers.routines.progress import Progress, SilentProgress
-
-ZOOM_STILL = 1e-3
-"""Relative change of zoom from frame to frame that counts as a zoom change."""
-LARGEST_SCALE_UNCERTAINTY = 0.05
-"""A calibration whose scale is known no better than this (95 %, relative) is refused."""
 
 
 class OpticsRun(NamedTuple):
@@ -126,16 +120,14 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
     Raises:
         IllConditioned: the run does not determine a calibration; the message says what was missing.
     """
-    final = _final_estimate(run)
-    outdated = any(_begins_change(final, later) for later in run.estimates[final.frame_index + 1 :])
-    covariance = np.array(final.covariance).reshape(6, 6)
-    parameters = optical_parameters(
-        final.projection,
-        covariance,
-        degrees_of_freedom=final.degrees_of_freedom,
+    choice = choose_estimate(
+        run.estimates,
         pixel_pitch_um=run.optics.pixel_pitch_um,
+        lost_frames=run.lost_frames,
+        unmatched_frames=run.unmatched_frames,
     )
-    _check_determined(parameters, run, final.degrees_of_freedom)
+    final, parameters = choice.estimate, choice.parameters
+    outdated = choice.frames_since_change > 0
     p = final.projection
     pitch_um = run.optics.pixel_pitch_um
     scales = _trace([e.scale_px_per_um for e in run.estimates])
@@ -155,7 +147,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         ),
         view=parameters.view,
         translation_um=parameters.translation_um,
-        covariance=covariance.tolist(),
+        covariance=np.array(final.covariance).reshape(6, 6).tolist(),
         degrees_of_freedom=final.degrees_of_freedom,
         prediction_error_px=_trace([e.prediction_error_px for e in run.estimates]),
         posterior_error_px=_trace([e.posterior_error_px for e in run.estimates]),
@@ -172,7 +164,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
             zoom=final.zoom,
         ),
         traces=_traces(run.estimates, scales),
-        notes=_notes(run, outdated_at=final.zoom if outdated else None),
+        notes=_notes(run, choice),
         provenance=provenance,
         truth=truth,
     )
@@ -183,7 +175,7 @@ def zoom_change(estimates: Sequence[OpticsEstimate]) -> ZoomChange | None:
 
     Where the zoom moved between two frames, no frame was exposed meanwhile: the first frame is the one after.
     """
-    first = max((i for i in range(1, len(estimates)) if _begins_change(estimates[i - 1], estimates[i])), default=None)
+    first = max((i for i in range(1, len(estimates)) if begins_change(estimates[i - 1], estimates[i])), default=None)
     if first is None:
         return None
     last = first - 1
@@ -201,37 +193,6 @@ def zoom_change(estimates: Sequence[OpticsEstimate]) -> ZoomChange | None:
         posterior_iterations_to_0p1_px=iterations_to_settle(posterior, first_frame=first),
         posterior_iterations_to_0p1_px_from_end=iterations_to_settle(posterior, first_frame=last + 1),
     )
-
-
-def _begins_change(before: OpticsEstimate, now: OpticsEstimate) -> bool:
-    if now.zoom_moving:
-        return not before.zoom_moving
-    return not before.zoom_moving and abs(now.zoom - before.zoom) > ZOOM_STILL * before.zoom
-
-
-def _final_estimate(run: OpticsRun) -> OpticsEstimate:
-    for estimate in reversed(run.estimates):
-        if estimate.valid and estimate.covariance:
-            return estimate
-    raise IllConditioned(
-        f"{len(run.estimates)} frames with a pose do not determine a calibration "
-        f"({run.lost_frames} frames without the target, {run.unmatched_frames} without a pose)",
-        remedy="let the stage move along both of its axes while the zoom rests, with the target in view",
-    )
-
-
-def _check_determined(parameters: OpticalParameters, run: OpticsRun, degrees_of_freedom: float) -> None:
-    sigma = parameters.sigma_scale_px_per_um
-    factor = student_factor(degrees_of_freedom)
-    relative = math.inf if sigma is None else factor * sigma / parameters.scale_px_per_um
-    if not relative <= LARGEST_SCALE_UNCERTAINTY:
-        x_um = [estimate.x_um for estimate in run.estimates]
-        y_um = [estimate.y_um for estimate in run.estimates]
-        raise IllConditioned(
-            f"{len(run.estimates)} frames leave the scale uncertain by {100 * relative:.0f} %: the stage moved over "
-            f"{max(x_um) - min(x_um):.3g} × {max(y_um) - min(y_um):.3g} µm",
-            remedy="take more frames, and move further and along both axes: a circle that fills the view is best",
-        )
 
 
 def _trace(values: Sequence[float]) -> Trace:
@@ -255,12 +216,15 @@ def _traces(estimates: Sequence[OpticsEstimate], scales: Trace) -> Traces:
     )
 
 
-def _notes(run: OpticsRun, outdated_at: float | None) -> list[str]:
+def _notes(run: OpticsRun, choice: Choice) -> list[str]:
     notes = []
-    if outdated_at is not None:
+    since = choice.frames_since_change
+    if since:
+        frames = "1 frame" if since == 1 else f"{since} frames"
         notes.append(
-            f"The run ended before the calibration had settled after the zoom change: this is the calibration at zoom "
-            f"{outdated_at:.4g}, and the zoom now reads {run.estimates[-1].zoom:.4g}."
+            f"The run ended {frames} after the zoom began to change, too few for the new zoom "
+            f"({choice.why_not_newer}): this is the calibration at zoom {choice.estimate.zoom:.4g}, and the zoom "
+            f"now reads {run.estimates[-1].zoom:.4g}."
         )
     if not run.complete:
         notes.append("The run was interrupted; the result holds what had been measured until then.")

@@ -1,0 +1,94 @@
+"""What `serve` refuses before anything is served, and what it writes."""
+
+import socket
+
+import pytest
+import yaml
+
+import microdrivers.rig.serving
+from microdrivers.configs import shipped_rig
+from microdrivers.devices.drivers import ServeRequest
+from microdrivers.rig import load_rig_file
+from microdrivers.rig.serving import ServedRig, check_writable
+
+RIG = shipped_rig("microscope")
+
+
+@pytest.fixture
+def own(tmp_path):
+    file = tmp_path / "lab.yaml"
+    file.write_text(RIG.read_text(encoding="utf-8"), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def nothing_served(monkeypatch):
+    def refuse(*_, **__):
+        pytest.fail("something is served")
+
+    monkeypatch.setattr(microdrivers.rig.serving, "ServedRig", refuse)
+
+
+@pytest.mark.usefixtures("nothing_served")
+@pytest.mark.parametrize("emulated", [False, True])
+def test_the_served_rig_is_never_overwritten(run, own, emulated):
+    own.write_text(own.read_text(encoding="utf-8") + f"emulated: {str(emulated).lower()}\n", encoding="utf-8")
+    before = own.read_bytes()
+    result = run("serve", own, "--write", own, "--for", 0)
+    assert result.exit_code == 1
+    assert "this is the rig file that is to be served" in result.output
+    assert own.read_bytes() == before
+
+
+@pytest.mark.usefixtures("nothing_served")
+@pytest.mark.parametrize(
+    "text", ["notes", "emulated: true\n", "# x, served on the endpoints below\nemulated: true\n", "\tno: yaml: {"]
+)
+def test_a_file_of_somebody_else_is_not_overwritten(run, own, tmp_path, text):
+    other = tmp_path / "other.yaml"
+    other.write_text(text, encoding="utf-8")
+    result = run("serve", own, "--write", other, "--for", 0)
+    assert result.exit_code == 1
+    assert "was not written by `microdrivers serve`" in result.output
+    assert other.read_text(encoding="utf-8") == text
+
+
+@pytest.mark.usefixtures("nothing_served")
+def test_a_missing_folder_is_one_clear_message(run, own):
+    result = run("serve", own, "--write", "none/served.yaml", "--for", 0)
+    assert result.exit_code == 1
+    assert "none/served.yaml: the folder does not exist" in result.output
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "-1"])
+@pytest.mark.usefixtures("nothing_served")
+def test_a_duration_is_a_number_of_seconds(run, own, seconds):
+    result = run("serve", own, "--for", seconds)
+    assert result.exit_code == 2
+    assert "--for" in result.output
+
+
+@pytest.mark.xdist_group("real_time")
+def test_what_serve_wrote_is_overwritten_and_names_a_host_that_others_reach(own, tmp_path):
+    file = tmp_path / "served.yaml"
+    for _ in range(2):
+        with ServedRig(load_rig_file(own), transport="tcp", bind="0.0.0.0") as serving:
+            serving.write(file)
+    text = file.read_text(encoding="utf-8")
+    assert "0.0.0.0" not in text
+    host = ServeRequest(transport="tcp", bind="0.0.0.0", folder=tmp_path).host
+    ports = [yaml.safe_load(text)["devices"][name]["connection"]["port"] for name in ("sample_stage", "zoom")]
+    assert all(port.startswith(f"socket://{host}:") for port in ports)
+    assert f"mjpeg+http://{host}:" in text
+    check_writable(file, load_rig_file(own))
+
+
+def test_a_machine_without_a_resolvable_name_gives_an_address(tmp_path, monkeypatch):
+    def unknown(*_):
+        raise socket.gaierror("unknown")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    for bind in ("0.0.0.0", "::", ""):
+        host = ServeRequest(transport="tcp", bind=bind, folder=tmp_path).host
+        assert host not in ("", "0.0.0.0", "::")
+    assert ServeRequest(transport="tcp", bind="127.0.0.1", folder=tmp_path).host == "127.0.0.1"
