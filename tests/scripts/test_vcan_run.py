@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import time
 import sys
 from pathlib import Path
 
@@ -177,6 +178,7 @@ def test_an_interrupted_run_ends_the_machine(open_session, monkeypatch, tmp_path
     def interrupt(self, process):
         while not (session.folder / "ready").exists():
             assert process.poll() is None
+        time.sleep(0.5)  # `timeout` passes a signal on only once its own fork has returned
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Session, "_wait", interrupt)
