@@ -80,10 +80,12 @@ class DescriptorPort:
 
     def read_available(self) -> bytes:
         """What has arrived."""
-        waiting = data = self._read()
-        while data and len(waiting) < _MOST_WAITING:
-            data = self._read()
-            waiting += data
+        waiting = b""
+        try:
+            while (data := os.read(self._descriptor, _CHUNK)) and len(waiting) < _MOST_WAITING:
+                waiting += data
+        except BlockingIOError:  # nothing there; a terminal says so with no bytes instead
+            pass
         return waiting
 
     def read_within(self, wait_ns: int) -> bytes:
@@ -99,12 +101,6 @@ class DescriptorPort:
         """Give the port up."""
         self._descriptor = -1  # its number may soon belong to another file
         self._give_up()
-
-    def _read(self) -> bytes:
-        try:
-            return os.read(self._descriptor, _CHUNK)
-        except BlockingIOError:
-            return b""
 
 
 class PyserialPort:

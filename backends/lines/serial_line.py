@@ -11,6 +11,7 @@ import msgspec
 from microdrivers.backends.lines.ports import Port, open_port
 from microdrivers.backends.lines.settings import SerialConnection
 from microdrivers.core.clock import Clock
+from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.errors import LinkLost, LinkTimeout, ProtocolError
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
 from microdrivers.devices.wire_tap import WireTap
@@ -49,6 +50,9 @@ class SerialLine:
     Args:
         gap_s: silence to keep between the end of a reply and the next request.
         tap: is told everything that passes.
+
+    Attributes:
+        byte_ns: what a byte takes on the line, by the baud rate.
     """
 
     def __init__(
@@ -60,7 +64,7 @@ class SerialLine:
         self._tap = tap
         self._gap_ns = seconds_to_ns(gap_s)
         self._wait_ns = seconds_to_ns(connection.timeout_s)
-        self._byte_ns = round(connection.bits_per_byte * NS_PER_S / connection.baudrate)
+        self.byte_ns = round(connection.bits_per_byte * NS_PER_S / connection.baudrate)
         self._lock = threading.Lock()
         self._posted: deque[bytes] = deque()
         self._free_at_ns = 0
@@ -98,28 +102,10 @@ class SerialLine:
             LinkLost: the port is gone. ProtocolError: the device sends without end.
         """
         wait_ns = self._wait_ns if timeout_s is None else seconds_to_ns(timeout_s)
+        if not self.clock.simulated:  # a transaction marks nothing in real time
+            return self._exchange(request, complete, wait_ns)
         with self.clock.transaction():
-            try:
-                with self._lock:
-                    return self._exchange(request, complete, wait_ns)
-            except OSError as error:
-                raise self._lost(error) from error
-            finally:
-                if self._posted:
-                    self._flush_posted()  # also after a failed exchange: a stop may be waiting
-
-    def send(self, request: bytes) -> None:
-        """Send what has no reply, in its turn."""
-        with self.clock.transaction():
-            try:
-                with self._lock:
-                    self._transmit(self._prepared(), request)
-                    self._free_at_ns = self.clock.now_ns() + len(request) * self._byte_ns + self._gap_ns
-            except OSError as error:
-                raise self._lost(error) from error
-            finally:
-                if self._posted:
-                    self._flush_posted()
+            return self._exchange(request, complete, wait_ns)
 
     def send_now(self, data: bytes) -> None:
         """Send at once, past any exchange under way; for full-duplex lines and commands without a reply."""
@@ -140,37 +126,51 @@ class SerialLine:
     # ------------------------------------------------------------------ inside
 
     def _exchange(self, request: bytes, complete: Callable[[bytes], bool], wait_ns: int) -> Exchange:
-        port = self._prepared()
-        now_ns = self.clock.now_ns
-        tap = self._listening_tap()
-        if tap is not None:
-            tap.sent(now_ns(), request)
-        start_ns = now_ns()
-        port.write(request)
-        request_ns = len(request) * self._byte_ns
-        remaining_ns = request_ns + wait_ns
-        reply, first_byte_ns = b"", 0
+        # In one piece: this is what a poll costs beyond the port itself (docs/decisions/0006).
         try:
-            while True:
-                data = port.read_within(remaining_ns)
-                arrived_ns = now_ns()
-                if not data:
-                    raise self._silence(request, reply, wait_ns)
+            with self._lock:
+                now_ns = self.clock.now_ns
+                port = self._port or self._require_port()
+                if self._suspect or self._free_at_ns > now_ns() or INTERRUPTION.requested:
+                    self._await_quiet(port)
+                stale = port.read_available()
+                if stale:
+                    self._discard(stale)
+                tap = self._tap
+                if tap is not None and not tap.topic.heard:
+                    tap = None
                 if tap is not None:
-                    tap.received(arrived_ns, data)
-                first_byte_ns = first_byte_ns or arrived_ns
-                reply += data
-                if complete(reply):
-                    break
-                if len(reply) > MAX_REPLY_BYTES:
-                    raise ProtocolError("the reply has no end", sent=request, received=reply[:64])
-                remaining_ns = wait_ns
-        except BaseException:
-            self._suspect = True  # also when interrupted: the reply may still be coming
-            raise
-        self._free_at_ns = arrived_ns + self._gap_ns
-        self.counters.exchanges += 1
-        return Exchange(reply, start_ns, start_ns + request_ns, first_byte_ns, arrived_ns)
+                    tap.sent(now_ns(), request)
+                start_ns = now_ns()
+                port.write(request)
+                request_ns = len(request) * self.byte_ns
+                reply, first_byte_ns, remaining_ns = b"", 0, request_ns + wait_ns
+                try:
+                    while True:
+                        data = port.read_within(remaining_ns)
+                        arrived_ns = now_ns()
+                        if not data:
+                            raise self._silence(request, reply, wait_ns)
+                        if tap is not None:
+                            tap.received(arrived_ns, data)
+                        first_byte_ns = first_byte_ns or arrived_ns
+                        reply += data
+                        if complete(reply):
+                            break
+                        if len(reply) > MAX_REPLY_BYTES:
+                            raise ProtocolError("the reply has no end", sent=request, received=reply[:64])
+                        remaining_ns = wait_ns
+                except BaseException:
+                    self._suspect = True  # also when interrupted: the reply may still be coming
+                    raise
+                self._free_at_ns = arrived_ns + self._gap_ns
+                self.counters.exchanges += 1
+                return Exchange(reply, start_ns, start_ns + request_ns, first_byte_ns, arrived_ns)
+        except OSError as error:
+            raise self._lost(error) from error
+        finally:
+            if self._posted:
+                self._flush_posted()  # also after a failed exchange: a stop may be waiting
 
     def _silence(self, request: bytes, reply: bytes, wait_ns: int) -> LinkTimeout:
         self._free_at_ns = self.clock.now_ns() + self._gap_ns
@@ -186,17 +186,11 @@ class SerialLine:
             remedy="check power, cable, baud rate, parity and the device's address",
         )
 
-    def _prepared(self) -> Port:
-        """Wait until the line is free, and drop what answers nothing: it must not be taken for the next reply."""
-        port = self._require_port()
-        if self._free_at_ns > self.clock.now_ns():
-            self.clock.sleep_until(self._free_at_ns)
+    def _await_quiet(self, port: Port) -> None:
+        """Wait until the line is free and nothing more comes that answers an earlier request."""
+        self.clock.sleep_until(self._free_at_ns)
         if self._suspect:
             self._resynchronise(port)
-        stale = port.read_available()
-        if stale:
-            self._discard(stale)
-        return port
 
     def _resynchronise(self, port: Port) -> None:
         """Read away what is still coming from an earlier request, until the line has been quiet for a while."""
@@ -222,25 +216,20 @@ class SerialLine:
     def _send_posted(self, data: bytes) -> None:
         self.clock.sleep_until(self._free_at_ns)
         self.send_now(data)
-        self._free_at_ns = self.clock.now_ns() + len(data) * self._byte_ns + self._gap_ns
+        self._free_at_ns = self.clock.now_ns() + len(data) * self.byte_ns + self._gap_ns
         self._suspect = True  # its reply, if any, must not be taken for the next one's
 
     # ------------------------------------------------------------------ the port
 
     def _transmit(self, port: Port, data: bytes) -> None:
-        tap = self._listening_tap()
-        if tap is not None:
-            tap.sent(self.clock.now_ns(), data)
+        if self._tap is not None:
+            self._tap.sent(self.clock.now_ns(), data)
         port.write(data)
 
     def _discard(self, data: bytes) -> None:
-        tap = self._listening_tap()
-        if tap is not None:
-            tap.received(self.clock.now_ns(), data)
+        if self._tap is not None:
+            self._tap.received(self.clock.now_ns(), data)
         self.counters.discarded_bytes += len(data)
-
-    def _listening_tap(self) -> WireTap | None:
-        return self._tap if self._tap is not None and self._tap.heard else None
 
     def _require_port(self) -> Port:
         if self._port is None:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
+from microdrivers.backends.lines.serial_line import Exchange
 from microdrivers.backends.pi_gcs import error_codes
 from microdrivers.backends.pi_gcs.axis_map import AxisMap, by_axis
 from microdrivers.backends.pi_gcs.controller_state import ControllerState, Findings
@@ -79,7 +80,7 @@ class Controller:
         self._rig_axes = rig_axes
         self._settings = settings
         self._reference_lost = reference_lost
-        self._latch_delay_ns = round(settings.latch.delay_ms * NS_PER_MS)
+        self._latched_after_ns = gcs.pose_asked_after_ns + round(settings.latch.delay_ms * NS_PER_MS)
         self._latch_dt_ns = round(settings.latch.uncertainty_ms * NS_PER_MS)
         self._adopt(rig_axes, {})
 
@@ -109,18 +110,37 @@ class Controller:
 
     def read(self) -> Reading:
         """Positions and status of the axes, in one exchange."""
-        before, targets = self._mark(), self.targets
+        before, targets = self.mark(), self.targets
         with self._naming:
-            pose = self.gcs.pose()
+            exchange = self.gcs.ask_pose()
+        return self.understand(exchange, before, targets)
+
+    def understand(self, exchange: Exchange, before: tuple[int, ...], targets: Mapping[str, float]) -> Reading:
+        """What an exchange says; `before` and `targets` are the mark and the targets from before it."""
+        with self._naming:
+            pose = self.gcs.understand_pose(exchange)
             native = by_axis(self.axes, pose.positions, command="POS?")
             status = self._status_by_axis(pose)
-        t_ns, dt_ns, source = self._stamp(pose)
+        t_ns, dt_ns, source = self.stamp(exchange)
         return Reading(
             t_ns, dt_ns, source, pose.start_ns, pose.end_ns,
             positions={axis: axis_map.position(native[axis]) for axis, axis_map in self.axes.items()},
-            targets=targets, status=status, before=before, after=self._mark(),
+            targets=targets, status=status, before=before, after=self.mark(),
             jumping=self.state.referencing is not None or any(found.referencing for found in status.values()),
         )  # fmt: skip
+
+    def mark(self) -> tuple[int, ...]:
+        """Changes with everything that makes positions jump or motion break off; see `Reading`."""
+        return self.gcs.stops, self.gcs.interruptions, self.state.changes
+
+    def stamp(self, exchange: Exchange) -> tuple[int, int, TimeSource]:
+        """When the controller sampled the positions, and how well that is known."""
+        latched_ns = exchange.request_start_ns + self._latched_after_ns
+        if latched_ns < exchange.first_byte_ns:
+            return latched_ns, self._latch_dt_ns, "request"
+        # By the baud rate the request had not ended when the reply began: a port that has none (USB, TCP).
+        half_ns = (exchange.first_byte_ns - exchange.request_start_ns) // 2
+        return exchange.request_start_ns + half_ns, half_ns, "midpoint"
 
     def contradicted_by(self, reading: Reading) -> bool:
         """Whether a reading calls for `examine`; tells a change once only."""
@@ -252,9 +272,6 @@ class Controller:
         pairs = (f"{axis_map.id} {texts[axis]}" for axis, axis_map in self.axes.items() if axis in texts)
         return f"{mnemonic} {' '.join(pairs)}"
 
-    def _mark(self) -> tuple[int, ...]:
-        return self.gcs.stops, self.gcs.interruptions, self.state.changes
-
     def _status_by_axis(self, pose: Pose) -> dict[str, AxisStatus]:
         if len(pose.status) <= max(self._status_index.values()):
             raise ProtocolError(
@@ -262,15 +279,6 @@ class Controller:
                 remedy="close and open the stage again",
             )
         return {axis: pose.status[index] for axis, index in self._status_index.items()}
-
-    def _stamp(self, pose: Pose) -> tuple[int, int, TimeSource]:
-        """When the controller sampled the positions."""
-        latched_ns = pose.asked_ns + self._latch_delay_ns
-        if latched_ns < pose.first_byte_ns:
-            return latched_ns, self._latch_dt_ns, "request"
-        # By the baud rate the request had not ended when the reply began: a port that has none (USB, TCP).
-        half_ns = (pose.first_byte_ns - pose.start_ns) // 2
-        return pose.start_ns + half_ns, half_ns, "midpoint"
 
     def naming_errors(self, axes: Iterable[str]) -> NamingErrors:
         """A context that says in errors whose they are: of these axes, or in a chain of this controller's."""

@@ -12,6 +12,7 @@ Only one controller is asked at a time, so that an answer of another one is alwa
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 from collections.abc import Callable, Sequence
@@ -28,6 +29,7 @@ STOP_ALL = "\x18"
 _READY = {"\xb1": True, "\xb0": False}
 _SINGLE_BYTE = (STATUS_REGISTER, REQUEST_READY, STOP_ALL)
 _POSITIONS = "POS?"
+_TWO_REPLIES = replies.completed_after(2)
 
 UNINTELLIGIBLE_REMEDY = (
     "check the baud rate (a wrong one gives garbage or silence), the cable, and that nothing else uses this line"
@@ -65,6 +67,7 @@ class Gcs:
         interruptions: how many exchanges have failed; whoever sees it change should doubt what he knew.
         stops: changes whenever a stop is sent.
         neighbours: the other controllers on the same line.
+        pose_asked_after_ns: from the start of the request for a pose until the last bit of `POS?` has left.
     """
 
     def __init__(self, line: SerialLine, *, address: int | None = None) -> None:
@@ -75,7 +78,7 @@ class Gcs:
         self.neighbours: Sequence[Gcs] = ()
         self._line = line
         self._pose_request = self.request(_POSITIONS, STATUS_REGISTER)
-        self._positions_end = len(self.request(_POSITIONS))
+        self.pose_asked_after_ns = len(self.request(_POSITIONS)) * line.byte_ns
         self._stop_numbers = itertools.count(1)
         self._error_pending = False
         self._suspect = False
@@ -126,7 +129,22 @@ class Gcs:
 
     def pose(self) -> Pose:
         """Positions and status in one write, so that they belong together."""
-        return self._patiently(self._pose, self._pose_request)
+        return self.understand_pose(self.ask_pose())
+
+    def ask_pose(self) -> Exchange:
+        """The exchange that holds a pose, as yet not understood."""
+        try:
+            return self._exchange(self._pose_request, _TWO_REPLIES)
+        except LinkTimeout as silence:
+            self._explain(silence, self._pose_request)
+        return self._exchange(self._pose_request, _TWO_REPLIES)
+
+    def understand_pose(self, exchange: Exchange) -> Pose:
+        """The pose in an exchange."""
+        positions, status = self._understand(exchange, self._pose_request, 2, _positions_and_status)
+        start_ns = exchange.request_start_ns
+        asked_ns = start_ns + self.pose_asked_after_ns
+        return Pose(positions, status, start_ns, asked_ns, exchange.first_byte_ns, exchange.end_ns)
 
     def error(self) -> int:
         """The controller's last error number, which this clears. Never repeated."""
@@ -187,18 +205,17 @@ class Gcs:
             for gcs in controllers:
                 gcs._note_stop()
 
+    def leave(self) -> None:
+        """Read away the error that our own stop has left, or the next program takes it for its own (pipython does)."""
+        if self.identity and self._error_pending and not self._suspect:
+            with contextlib.suppress(LinkError):
+                self.error()
+
     # ------------------------------------------------------------------ inside
 
     def _note_stop(self) -> None:
         self.stops = next(self._stop_numbers)
         self._error_pending = True
-
-    def _pose(self, request: bytes) -> Pose:
-        exchange, (positions, status) = self._ask_timed(request, 2, _positions_and_status)
-        start_ns = exchange.request_start_ns
-        wire_ns = exchange.request_end_ns - start_ns
-        asked_ns = start_ns + wire_ns * self._positions_end // len(request)
-        return Pose(positions, status, start_ns, asked_ns, exchange.first_byte_ns, exchange.end_ns)
 
     def _query(self, command: str, parse: Callable[[replies.Reply], ResultT]) -> ResultT:
         request = self.request(command)
@@ -224,22 +241,24 @@ class Gcs:
             raise error_codes.error_from(code, sent=request) from silence
 
     def _ask(self, request: bytes, count: int, parse: Callable[..., ResultT]) -> ResultT:
-        return self._ask_timed(request, count, parse)[1]
-
-    def _ask_timed(self, request: bytes, count: int, parse: Callable[..., ResultT]) -> tuple[Exchange, ResultT]:
         """One exchange whose reply consists of `count` GCS replies, which `parse` is given."""
+        return self._understand(self._exchange(request, replies.completed_after(count)), request, count, parse)
+
+    def _exchange(self, request: bytes, complete: Callable[[bytes], bool]) -> Exchange:
         try:
             if self._suspect:
                 self._resynchronise()
-            exchange = self._line.exchange(request, replies.completed_after(count))
+            return self._line.exchange(request, complete)
         except LinkError:
             self._interrupted()
             raise
+
+    def _understand(self, exchange: Exchange, request: bytes, count: int, parse: Callable[..., ResultT]) -> ResultT:
         try:
             found = replies.split_replies(exchange.reply, count)
             if self.address is not None:
                 found = [replies.without_address(reply, self.address) for reply in found]
-            return exchange, parse(*found)
+            return parse(*found)
         except ProtocolError as error:
             self._interrupted()
             raise ProtocolError(

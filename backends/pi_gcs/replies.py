@@ -45,7 +45,7 @@ class AxisStatus(NamedTuple):
 
 def completed_after(count: int) -> Callable[[bytes], bool]:
     """A test that tells whether `count` whole replies have arrived."""
-    return lambda received: _count_replies(received) >= count
+    return lambda received: received.count(b"\n") - received.count(b" \n") >= count
 
 
 def split_replies(received: bytes, count: int) -> list[Reply]:
@@ -54,7 +54,7 @@ def split_replies(received: bytes, count: int) -> list[Reply]:
     Raises:
         ProtocolError: another number of replies, an incomplete one, or bytes that are no text.
     """
-    if not received.endswith(b"\n") or _count_replies(received) != count:
+    if not received.endswith(b"\n") or received.count(b"\n") - received.count(b" \n") != count:
         raise ProtocolError(f"{count} whole replies were expected")
     text = received.decode("latin-1")
     if not _PRINTABLE.fullmatch(text):
@@ -147,7 +147,3 @@ def decimal(value: float) -> str:
     """A number for a request: rounded to seven decimals, plain notation, no more bytes than needed."""
     text = f"{value:.7f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
-
-
-def _count_replies(received: bytes) -> int:
-    return received.count(b"\n") - received.count(b" \n")

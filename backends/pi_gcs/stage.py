@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from microdrivers.backends.lines.serial_line import SerialLine
+from microdrivers.backends.lines.serial_line import Exchange, SerialLine
 from microdrivers.backends.pi_gcs.axis_map import AxisMap
 from microdrivers.backends.pi_gcs.chain_pose import PoseReader
 from microdrivers.backends.pi_gcs.controller import Controller, Reading
 from microdrivers.backends.pi_gcs.protocol import Gcs
 from microdrivers.backends.pi_gcs.referencing import ReferenceSearch
 from microdrivers.backends.pi_gcs.settings import GcsStageSettings
+from microdrivers.backends.pi_gcs.steady_pose import SteadyPose
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import DeviceFault, LinkError, MicrodriversError, MoveCancelled, RefusedError
@@ -21,6 +22,7 @@ from microdrivers.devices.wire_tap import WireTap
 from microdrivers.devices.xytheta_stage import AXES, XYThetaStage
 
 FAULT_FLAG = "FAULT"
+_FAULT, _NO_FLAGS = frozenset({FAULT_FLAG}), frozenset[str]()
 
 
 class GcsXYThetaStage(XYThetaStage):
@@ -44,7 +46,9 @@ class GcsXYThetaStage(XYThetaStage):
         self._settings = settings
         self._line = SerialLine(settings.connection, clock=clock, tap=WireTap(name, bus))
         self._controllers = self._make_controllers()
+        self._alone = self._controllers[0] if len(self._controllers) == 1 else None
         self._poses = PoseReader(self._ask_all)
+        self._steady: SteadyPose | None = None
         self._adopt_limits()
 
     def _make_controllers(self) -> tuple[Controller, ...]:
@@ -84,6 +88,7 @@ class GcsXYThetaStage(XYThetaStage):
             error.moved = "no"
             raise
         self._poses = PoseReader(self._ask_all)
+        self._steady = None
         self._adopt_limits()
         return _joined(found)
 
@@ -93,6 +98,8 @@ class GcsXYThetaStage(XYThetaStage):
         return vars(self._line.counters)
 
     def _close(self) -> None:
+        for controller in self._controllers:
+            controller.gcs.leave()
         self._line.close()
         for controller in self._controllers:
             controller.forget()
@@ -108,7 +115,47 @@ class GcsXYThetaStage(XYThetaStage):
     # ------------------------------------------------------------------ reading
 
     def _read(self) -> XYThetaSample:
-        pose = self._poses.read()
+        """A pose, with little work if nothing but positions has changed since the last one."""
+        controller = self._alone
+        if controller is None:
+            return self._sample(self._poses.read())
+        targets = controller.targets
+        exchange = controller.gcs.ask_pose()
+        steady = self._steady
+        positions = None if steady is None else steady.positions_in(exchange.reply, controller.mark())
+        if steady is None or positions is None:
+            return self._work_out(controller, exchange, targets)
+        t_ns, dt_ns, source = controller.stamp(exchange)
+        return XYThetaSample(
+            t_ns=t_ns,
+            dt_ns=dt_ns,
+            t_source=source,
+            device=self.name,
+            seq=self._next_seq(),
+            flags=_FAULT if controller.state.dropped else _NO_FLAGS,
+            x_um=positions[0],
+            y_um=positions[1],
+            theta_deg=positions[2],
+            target_x_um=targets["x"],
+            target_y_um=targets["y"],
+            target_theta_deg=targets["theta"],
+            moving=steady.moving,
+            on_target=steady.on_target,
+            referenced=steady.referenced,
+        )
+
+    def _work_out(self, controller: Controller, exchange: Exchange, targets: Mapping[str, float]) -> XYThetaSample:
+        """What an exchange means, and whether the next one may be taken to mean the same."""
+        mark, self._steady = controller.mark(), None
+        reading = controller.understand(exchange, mark, targets)
+        if controller.contradicted_by(reading):
+            controller.examine()
+        sample = self._sample(reading)
+        if mark == controller.mark():
+            self._steady = SteadyPose.after(exchange.reply, sample, mark, controller.axes)
+        return sample
+
+    def _sample(self, pose: Reading) -> XYThetaSample:
         status = pose.status.values()
         in_servo = [axis_status for axis_status in status if axis_status.servo_on]
         targets = self._still_valid(pose.targets)
@@ -118,7 +165,7 @@ class GcsXYThetaStage(XYThetaStage):
             t_source=pose.source,
             device=self.name,
             seq=self._next_seq(),
-            flags=frozenset({FAULT_FLAG} if any(found.state.dropped for found in self._controllers) else ()),
+            flags=_FAULT if any(found.state.dropped for found in self._controllers) else _NO_FLAGS,
             x_um=pose.positions["x"],
             y_um=pose.positions["y"],
             theta_deg=pose.positions["theta"],

@@ -1,0 +1,355 @@
+"""A CAN bus that many devices share: frames out from any thread, frames in to whoever listens, all on the clock.
+
+In real time one thread receives. On a simulated clock there is none: the clock calls when something has arrived, and
+whoever waits for an answer receives meanwhile, for everybody. So does the receiving thread when one of its listeners
+waits for an answer: no listener can make the line deaf (docs/decisions/0014).
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from microdrivers.backends.lines.can_adapter import CanAdapter
+from microdrivers.backends.lines.can_listeners import (
+    SILENCE_REMEDY,
+    CanCounters,
+    Listener,
+    Listeners,
+    Listening,
+    LossListener,
+    Received,
+    Upkeep,
+)
+from microdrivers.backends.lines.can_load import LoadMeter
+from microdrivers.backends.lines.settings import CanConnection
+from microdrivers.core.clock import Clock, ClockEvent, Timer
+from microdrivers.core.errors import BusyError, ConfigError, LinkError, LinkLost, LinkTimeout
+from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
+
+if TYPE_CHECKING:
+    import can
+
+ServiceT = TypeVar("ServiceT")
+
+_RECEIVE_S = 0.1
+_LOCK_STEP_NS = NS_PER_MS
+_SHORTEST_FRAME_BITS = 44
+
+__all__ = ["CanLine", "Listening", "Received", "SILENCE_REMEDY", "shared_can_line"]
+
+
+class CanLine:
+    """One bus; see the module. Get it with `shared_can_line`.
+
+    `send` takes no lock that anybody holds while waiting, so a stop can be sent at any time.
+
+    Attributes:
+        counters: what has happened since it was opened.
+        newest_ns: stamp of the newest frame received, ns.
+    """
+
+    def __init__(self, connection: CanConnection, *, clock: Clock) -> None:
+        self.connection = connection
+        self.clock = clock
+        self.counters = CanCounters()
+        self.newest_ns = -1
+        self._load = LoadMeter(connection.bitrate)
+        self._adapter: CanAdapter | None = None
+        self._lost: LinkLost | None = None
+        self._users = 0
+        self._life = threading.RLock()
+        self._sending = threading.Lock()
+        self._failing = threading.Lock()
+        self._listeners = Listeners(clock)
+        self._waiting: set[ClockEvent] = set()
+        self._services: dict[object, Any] = {}
+        self._upkeep = Upkeep(needed=clock.simulated)
+        self._receiver: Timer | None = None
+        self._receiving_thread = 0
+
+    # ------------------------------------------------------------------ life
+
+    def open(self) -> None:
+        """Open the adapter for the first who asks, and again if it was lost; `close` as often.
+
+        Raises:
+            LinkLost, ConfigError, UnsupportedError: it cannot be opened; the remedy says what to do.
+        """
+        with self._life:
+            if self._lost is not None:
+                self._end()
+            if self._adapter is None:
+                self.counters = CanCounters()
+                self._begin(CanAdapter(self.connection, clock=self.clock, counters=self.counters))
+            self._users += 1
+
+    def close(self) -> None:
+        """Give the adapter up with the last who has opened it."""
+        with self._life:
+            self._users = max(0, self._users - 1)
+            if not self._users:
+                self._end()
+
+    def _begin(self, adapter: CanAdapter) -> None:
+        self._adapter, self._lost = adapter, None
+        adapter.accept(self._listeners.cob_ids)
+        if self.clock.simulated:
+            adapter.notify(self._drain)
+        else:
+            self._receiver = self.clock.call_at(
+                self.clock.now_ns(), lambda: self._receive_until_closed(adapter), name=f"CAN {self.connection.channel}"
+            )
+
+    def _end(self) -> None:
+        adapter, self._adapter = self._adapter, None
+        receiver, self._receiver = self._receiver, None
+        if receiver is not None:
+            receiver.cancel()
+        if adapter is not None:
+            adapter.close()
+        self._lost = None
+
+    # ------------------------------------------------------------------ traffic
+
+    def send(self, cob_id: int, data: bytes = b"") -> None:
+        """Send a frame, from any thread; nothing is awaited.
+
+        Raises:
+            LinkTimeout: nobody acknowledges frames. LinkLost: the adapter is gone, or off the bus.
+        """
+        adapter = self._require_adapter()
+        try:
+            with self._sending:
+                adapter.send(cob_id, data)
+        except adapter.failures as error:
+            raise self._failed(adapter, error) from error
+        self.counters.sent += 1
+        self._load.add(self.clock.now_ns(), len(data))
+
+    def listen(self, cob_id: int, call: Listener) -> Listening:
+        """Call with every data frame of that identifier, in the thread that receives it."""
+        is_new, adapter = self._listeners.add(cob_id, call), self._adapter
+        if is_new and adapter is not None:
+            adapter.accept(self._listeners.cob_ids)
+        return Listening(lambda: self._listeners.remove(cob_id, call))
+
+    def exchange(
+        self, cob_id: int, data: bytes, reply_id: int, accept: Callable[[bytes], bool], timeout_s: float
+    ) -> Received:
+        """Send a frame and wait for the first one of `reply_id` that is accepted.
+
+        Raises:
+            LinkTimeout: none came. LinkLost: the adapter is gone, or off the bus.
+        """
+        found: list[Received] = []
+        flag = self.clock.event()
+
+        def take(received: Received) -> None:
+            if not found and accept(received.data):
+                found.append(received)
+                flag.set()
+
+        listening = self.listen(reply_id, take)
+        try:
+            with nullcontext() if self.clock.in_transaction else self.clock.transaction():
+                self.send(cob_id, data)
+                self.wait(flag, timeout_s)
+        finally:
+            listening.cancel()
+        if not found:
+            self.counters.timeouts += 1
+            raise self.silence(f"no reply to {cob_id:03X}#{data.hex().upper()}", timeout_s)
+        self.counters.exchanges += 1
+        return found[0]
+
+    def silence(self, what: str, timeout_s: float) -> LinkTimeout:
+        """The error for something that has not come; it says so if the bit rate is to be suspected."""
+        where = f"within {1000 * timeout_s:.0f} ms on CAN bus {self.connection.channel}"
+        return LinkTimeout(f"{what} {where}{self.counters.hint()}", remedy=SILENCE_REMEDY)
+
+    def on_loss(self, call: LossListener) -> Listening:
+        """Call when the adapter is gone or off the bus, in whichever thread notices; not when the line is closed."""
+        self._listeners.add_loss(call)
+        return Listening(lambda: self._listeners.remove_loss(call))
+
+    # ------------------------------------------------------------------ waiting
+
+    def wait(self, flag: ClockEvent, timeout_s: float) -> bool:
+        """Wait until a listener has raised the flag; tells whether it is up.
+
+        Raises:
+            LinkLost: the adapter is gone, or off the bus.
+        """
+        self._waiting.add(flag)
+        try:
+            if self.clock.simulated or threading.get_ident() == self._receiving_thread:
+                self._receive_meanwhile(flag, self.clock.now_ns() + seconds_to_ns(timeout_s))
+            elif self._lost is None:
+                flag.wait(timeout_s)
+        finally:
+            self._waiting.discard(flag)
+        self._require_adapter()
+        return flag.is_set()
+
+    def acquire(self, lock: threading.Lock, *, timeout_s: float, what: str) -> None:
+        """Take a lock that others hold while they wait for frames; the receiving thread receives meanwhile.
+
+        Raises:
+            BusyError: it did not become free; `what` is under way.
+        """
+        if lock.acquire(blocking=False):
+            return
+        deadline_ns = self.clock.now_ns() + seconds_to_ns(timeout_s)
+        taken = False
+        if threading.get_ident() == self._receiving_thread:
+            while not (taken := lock.acquire(blocking=False)) and self.clock.now_ns() < deadline_ns:
+                self._receive(min(deadline_ns, self.clock.now_ns() + _LOCK_STEP_NS))
+        elif not self.clock.simulated:  # where there is one thread only, whoever holds it cannot go on meanwhile
+            taken = lock.acquire(timeout=timeout_s)
+        if not taken:
+            raise BusyError(f"{what} is under way", remedy="wait until it has ended, or stop the device")
+
+    @contextmanager
+    def holding(self, lock: threading.Lock, *, timeout_s: float, what: str) -> Iterator[None]:
+        """Hold a lock; see `acquire`."""
+        self.acquire(lock, timeout_s=timeout_s, what=what)
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def keep_up(self, upkeep: Callable[[], int]) -> Listening:
+        """Have something done in time also while an exchange waits on a simulated clock, where timers then stand still.
+
+        `upkeep` does what is due and returns when to be called again, ns. In real time it is never called.
+        """
+        self._upkeep.add(upkeep)
+        return Listening(lambda: self._upkeep.remove(upkeep))
+
+    # ------------------------------------------------------------------ facts
+
+    @property
+    def load(self) -> float:
+        """Share of the bus' time that the frames of this line took of late, 0 to 1: sent, and listened for.
+
+        Stuff bits are counted at their most. Frames that nobody on this line listens for may be left out.
+        """
+        return self._load.share(self.clock.now_ns())
+
+    @property
+    def stamps_frames(self) -> bool:
+        """Whether frames are stamped as they pass, and not when they are handed over."""
+        return self._adapter is not None and self._adapter.stamps_frames
+
+    def shortest_ns(self, length: int) -> int:
+        """The shortest time that a data frame of so many bytes can take on the bus."""
+        return (_SHORTEST_FRAME_BITS + 8 * length) * NS_PER_S // self.connection.bitrate
+
+    def service(self, kind: Callable[[CanLine], ServiceT]) -> ServiceT:
+        """The one object of that kind which all users of the line share, made for the first who asks."""
+        with self._life:
+            if kind not in self._services:
+                self._services[kind] = kind(self)
+            found: ServiceT = self._services[kind]
+            return found
+
+    # ------------------------------------------------------------------ receiving
+
+    def _receive_until_closed(self, adapter: CanAdapter) -> None:
+        self._receiving_thread = threading.get_ident()
+        while self._adapter is adapter and self._lost is None:
+            self._receive(self.clock.now_ns() + seconds_to_ns(_RECEIVE_S))
+
+    def _receive_meanwhile(self, flag: ClockEvent, deadline_ns: int) -> None:
+        if self.clock.simulated and not self.clock.in_transaction:
+            with self.clock.transaction():
+                self._receive_meanwhile(flag, deadline_ns)
+            return
+        while not flag.is_set() and self._lost is None:
+            now_ns = self.clock.now_ns()
+            if now_ns >= deadline_ns:
+                break
+            self._receive(min(deadline_ns, self._upkeep.do(now_ns)))
+
+    def _drain(self) -> None:
+        while self._receive(0):
+            pass
+
+    def _receive(self, until_ns: int) -> bool:
+        """Take the next frame that comes by then; tells whether one came."""
+        adapter = self._adapter
+        if adapter is None or self._lost is not None:
+            return False
+        try:
+            message = adapter.receive(max(0, until_ns - self.clock.now_ns()) / NS_PER_S)
+        except adapter.failures as error:
+            if self._adapter is adapter:
+                self._failed(adapter, error)
+            return False
+        if message is None:
+            return False
+        self._take(adapter, message)
+        return True
+
+    def _take(self, adapter: CanAdapter, message: can.Message) -> None:
+        self.counters.received += 1
+        data = bytes(message.data)
+        self._load.add(self.clock.now_ns(), len(data))
+        calls = self._listeners.of(message.arbitration_id)
+        if not calls or message.is_extended_id or message.is_remote_frame:
+            return
+        received = Received(message.arbitration_id, data, *adapter.stamp(message))
+        self.newest_ns = max(self.newest_ns, received.t_ns)
+        self._listeners.call(calls, received)
+
+    # ------------------------------------------------------------------ failing
+
+    def _failed(self, adapter: CanAdapter, cause: Exception) -> LinkError:
+        """Note a failure; returns the error for whoever caused or awaits something."""
+        error = adapter.explain(cause)
+        if not isinstance(error, LinkLost):
+            return error
+        error.what += self.counters.hint()
+        with self._failing:
+            if self._lost is not None or self._adapter is not adapter:
+                return error
+            self._lost = error
+        for flag in tuple(self._waiting):
+            flag.set()
+        for call in self._listeners.on_loss:
+            call(error)
+        return error
+
+    def _require_adapter(self) -> CanAdapter:
+        if self._lost is not None:
+            raise LinkLost(self._lost.what, remedy=self._lost.remedy)
+        if self._adapter is None:
+            raise LinkLost("the CAN bus is closed", remedy="open the device first", moved="no")
+        return self._adapter
+
+
+_lines: weakref.WeakValueDictionary[tuple[int, str, str], CanLine] = weakref.WeakValueDictionary()
+
+
+def shared_can_line(connection: CanConnection, *, clock: Clock) -> CanLine:
+    """The line of that interface and channel on that clock, closed until somebody opens it.
+
+    Raises:
+        ConfigError: another device of the rig wants another bit rate, or other options, of the same bus.
+    """
+    key = (id(clock), connection.interface, connection.channel)
+    line = _lines.get(key)
+    if line is None:
+        line = _lines[key] = CanLine(connection, clock=clock)
+    for setting in ("bitrate", "options"):
+        wanted, present = getattr(connection, setting), getattr(line.connection, setting)
+        if wanted != present:
+            raise ConfigError(
+                f"another device on {connection.channel} has {setting} {present}, this one {wanted}",
+                key=f"connection.{setting}", remedy=f"give all devices of a bus the same {setting}",
+            )  # fmt: skip
+    return line

@@ -1,0 +1,142 @@
+"""Who listens for which frames on a CAN line, what has passed there, and what must not wait."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import NamedTuple
+
+from microdrivers.core.clock import Clock
+from microdrivers.core.errors import LinkLost
+
+SILENCE_REMEDY = (
+    "check power, the node id switches, the bit rate, the cable and its termination (60 Ω between CAN_H and CAN_L)"
+)
+
+_NEVER_NS = 1 << 63
+
+
+class Received(NamedTuple):
+    """A data frame; `t_ns` ± `dt_ns` is when it had arrived on the bus, on the rig's clock."""
+
+    cob_id: int
+    data: bytes
+    t_ns: int
+    dt_ns: int
+
+
+Listener = Callable[[Received], object]
+LossListener = Callable[[LinkLost], object]
+
+
+class Listening:
+    """Something that goes on until it is cancelled."""
+
+    def __init__(self, end: Callable[[], object]) -> None:
+        self._end = end
+
+    def cancel(self) -> None:
+        """End it; idempotent."""
+        end, self._end = self._end, lambda: None
+        end()
+
+
+class CanCounters:
+    """What has happened on a line since it was opened."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+        self.received = 0
+        self.exchanges = 0
+        self.timeouts = 0
+        self.error_frames = 0
+        self.garbled = 0
+
+    def hint(self) -> str:
+        """What a message of something that failed may add: whether the bit rate is to be suspected."""
+        if self.error_frames and not self.received:
+            return f" ({self.error_frames} error frames and no sound one: is the bit rate right?)"
+        return f" ({self.error_frames} error frames)" if self.error_frames else ""
+
+
+class Listeners:
+    """Tables that may be changed from any thread while another one goes through them."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._by_id: dict[int, tuple[Listener, ...]] = {}
+        self._on_loss: tuple[LossListener, ...] = ()
+
+    @property
+    def cob_ids(self) -> Iterable[int]:
+        """All that anybody has ever listened for."""
+        return tuple(self._by_id)
+
+    def of(self, cob_id: int) -> tuple[Listener, ...]:
+        """Whom to call with a frame."""
+        return self._by_id.get(cob_id, ())
+
+    def call(self, calls: Iterable[Listener], received: Received) -> None:
+        """Give a frame to these. An error of one reaches the main program, and neither the others nor the line."""
+        for call in calls:
+            try:
+                call(received)
+            except Exception as error:  # noqa: BLE001 - it must not make the line deaf: the clock hands it on
+                self._clock.call_at(self._clock.now_ns(), partial(_fail, error), name="CAN listener")
+
+    @property
+    def on_loss(self) -> tuple[LossListener, ...]:
+        """Whom to tell of a lost adapter."""
+        return self._on_loss
+
+    def add(self, cob_id: int, call: Listener) -> bool:
+        """Call with frames of that identifier from now on; tells whether nobody has listened for it before."""
+        with self._lock:
+            is_new = cob_id not in self._by_id
+            self._by_id[cob_id] = (*self.of(cob_id), call)
+            return is_new
+
+    def remove(self, cob_id: int, call: Listener) -> None:
+        """Do not call any more. The identifier stays known."""
+        with self._lock:
+            self._by_id[cob_id] = tuple(each for each in self.of(cob_id) if each is not call)
+
+    def add_loss(self, call: LossListener) -> None:
+        """Call when the adapter is lost."""
+        with self._lock:
+            self._on_loss = (*self._on_loss, call)
+
+    def remove_loss(self, call: LossListener) -> None:
+        """Do not call any more."""
+        with self._lock:
+            self._on_loss = tuple(each for each in self._on_loss if each is not call)
+
+
+def _fail(error: Exception) -> None:
+    raise error
+
+
+class Upkeep:
+    """What has to be done in time also while an exchange waits where timers then stand still: on a simulated clock."""
+
+    def __init__(self, *, needed: bool) -> None:
+        self._calls: tuple[Callable[[], int], ...] = ()
+        self._start_ns = 0 if needed else _NEVER_NS
+        self._next_ns = self._start_ns
+
+    def add(self, call: Callable[[], int]) -> None:
+        """Have it called when it is due; it returns when that is, ns."""
+        self._calls = (*self._calls, call)
+        self._next_ns = self._start_ns
+
+    def remove(self, call: Callable[[], int]) -> None:
+        """Do not call any more."""
+        self._calls = tuple(each for each in self._calls if each is not call)
+
+    def do(self, now_ns: int) -> int:
+        """Do what is due; returns when something is due again."""
+        if now_ns >= self._next_ns:
+            self._next_ns = max(now_ns + 1, min((call() for call in self._calls), default=_NEVER_NS))
+        return self._next_ns
