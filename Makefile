@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 SEED   ?= 0
 OUT    ?= runs/demo
 
-.PHONY: demo test test-vcan test-vm check format lock bench clean help
+.PHONY: demo test test-ports test-vcan test-vm check format lock bench clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p;/^$$/q' Makefile
@@ -27,6 +27,10 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
+
+# Fine stages and force sensors behind a serial CAN adapter and on Modbus, in real time and one after the other.
+test-ports: $(READY)
+	$(BIN)/python -m pytest -q -m ports $(PYTEST_ARGS) tests/conformance tests/backends
 
 # The CAN tests on a real SocketCAN bus: this kernel's vcan if it has one, else User Mode Linux, which it fetches once.
 test-vcan: $(READY)

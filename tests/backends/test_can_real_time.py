@@ -19,7 +19,7 @@ from tests.backends.canopen_bench import LineBench
 from tests.backends.canopen_peer import PeerNode
 from tests.backends.cia402_bench import Bench
 
-pytestmark = pytest.mark.xdist_group("real_time")
+pytestmark = pytest.mark.ports  # with the machine to themselves: threads, drives and heartbeats in real time
 
 
 @pytest.fixture

@@ -185,7 +185,7 @@ def an_unreferenced_axis_refuses_absolute_moves(bench: FineStageBench) -> None:
     """One drive is switched off and on: within two heartbeats its axis counts as not referenced."""
     assert all(bench.stage.referenced.values())
     bench.need(bench.power_cycle)()
-    bench.clock.sleep(1.0)
+    bench.clock.sleep(2.5)
     assert not all(bench.stage.referenced.values())
     start = _truth(bench)
     with pytest.raises((NotReferenced, LinkLost)):

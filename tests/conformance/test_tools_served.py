@@ -7,8 +7,8 @@ from microdrivers.configs import shipped_rig
 from tests.conformance import fine_stage_suite, force_suite
 from tests.conformance.tool_bench import bring_home, served_fine_stage_bench, served_force_bench
 
-# One after the other: they run in real time.
-pytestmark = pytest.mark.xdist_group("real_time_tools")
+# With the machine to themselves, by `make test-ports`: they run in real time, drives and host watching each other.
+pytestmark = pytest.mark.ports
 
 FINE, FORCE = fine_stage_suite.SUITE.checks, force_suite.SUITE.checks
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+import yaml
 
 from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import Clock, SimulatedClock
@@ -145,10 +148,18 @@ def served_fine_stage_bench(
     pose_rate_hz: float = 50.0,
     file: Path | None = None,
 ) -> Iterator[FineStageBench]:
-    """The probe's stage in real time, behind a serial adapter or on a SocketCAN interface."""
-    with served(transport, "probe_stage", can_interface=can_interface, file=file or shipped_rig()) as (rig, serving):
-        stage = rig.device("probe_stage", FineStage)
-        yield _fine_stage_bench(stage, rig.clock, serving.simulation, pose_rate_hz=pose_rate_hz)
+    """The probe's stage in real time, behind a serial adapter or on a SocketCAN interface.
+
+    Its heartbeats are slow: a computer that runs tests, drives and host at once may be late for faster ones.
+    """
+    data = yaml.safe_load((file or shipped_rig()).read_text(encoding="utf-8"))
+    data["devices"]["probe_stage"]["heartbeat_ms"] = 1000
+    with tempfile.TemporaryDirectory() as folder:
+        patient = Path(folder) / "patient.yaml"
+        patient.write_text(yaml.safe_dump(data), encoding="utf-8")
+        with served(transport, "probe_stage", can_interface=can_interface, file=patient) as (rig, serving):
+            stage = rig.device("probe_stage", FineStage)
+            yield _fine_stage_bench(stage, rig.clock, serving.simulation, pose_rate_hz=pose_rate_hz)
 
 
 @contextmanager
