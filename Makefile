@@ -28,9 +28,10 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
 
-# Fine stages and force sensors behind a serial CAN adapter and on Modbus, in real time and one after the other.
+# What needs the machine to itself, in real time and one after the other: tools behind a serial CAN adapter and on
+# Modbus, independent Modbus masters, a calibration of a served rig.
 test-ports: $(READY)
-	$(BIN)/python -m pytest -q -m ports $(PYTEST_ARGS) tests/conformance tests/backends
+	$(BIN)/python -m pytest -q -m ports $(PYTEST_ARGS) tests/conformance tests/backends tests/judges tests/routines
 
 # The CAN tests on a real SocketCAN bus: this kernel's vcan if it has one, else User Mode Linux, which it fetches once.
 test-vcan: $(READY)

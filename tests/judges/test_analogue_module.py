@@ -12,7 +12,7 @@ from tests.fakes.analogue_bench import ForceOnlyWorld, attach, module_behind
 from tests.judges.clients import run_client
 
 # One after the other: they run in real time.
-pytestmark = pytest.mark.xdist_group("real_time")
+pytestmark = pytest.mark.ports
 
 
 @contextmanager

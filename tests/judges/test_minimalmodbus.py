@@ -7,7 +7,7 @@ from tests.judges.clients import run_client
 from tests.judges.served_zoom import served_zoom
 
 # One after the other: they run in real time.
-pytestmark = pytest.mark.xdist_group("real_time")
+pytestmark = pytest.mark.ports
 
 # It does not keep the 3 ms that the drive needs between its reply and the next request (HP-5142E), so each call is
 # followed by a pause.

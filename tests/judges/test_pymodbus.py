@@ -6,7 +6,7 @@ from tests.judges.clients import run_client
 from tests.judges.served_zoom import served_zoom
 
 # One after the other: they run in real time.
-pytestmark = pytest.mark.xdist_group("real_time")
+pytestmark = pytest.mark.ports
 
 LINKS = {"RTU on a pseudo-terminal": ("pty", "rtu"), "RTU over TCP": ("tcp", "rtu"), "Modbus TCP": ("tcp", "tcp")}
 

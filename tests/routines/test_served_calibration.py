@@ -25,7 +25,7 @@ from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.provenance import describe_run
 
 # One after the other: they run in real time.
-pytestmark = pytest.mark.xdist_group("real_time")
+pytestmark = pytest.mark.ports
 
 SEED = 3
 
