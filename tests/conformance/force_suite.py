@@ -25,7 +25,10 @@ def _streamed(bench: ForceBench, seconds: float) -> list[ForceSample]:
 
 
 def _mean(samples: list[ForceSample]) -> float:
-    return sum(sample.force_uN for sample in samples) / len(samples)
+    """Of the valid readings, nearly all: in real time the computer that plays the device may pause."""
+    valid = [sample.force_uN for sample in samples if not math.isnan(sample.force_uN)]
+    assert len(valid) >= 0.8 * len(samples)
+    return sum(valid) / len(valid)
 
 
 @SUITE.check
