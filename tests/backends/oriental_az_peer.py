@@ -90,12 +90,13 @@ class Script:
 
 
 class Leg(NamedTuple):
-    """One motion at constant speed."""
+    """One motion at `steps_per_ns` from `first` on; at `end_ns` it stands at `last`, whether it was planned so or not."""
 
     start_ns: int
     end_ns: int
     first: int
     last: int
+    steps_per_ns: float = 0.0
     interrupted: bool = False
 
 
@@ -136,8 +137,7 @@ class SheetDrive:
         leg = next(leg for leg in reversed(self._legs) if leg.start_ns <= t_ns)
         if t_ns >= leg.end_ns:
             return leg.last
-        share = (t_ns - leg.start_ns) / (leg.end_ns - leg.start_ns)
-        return round(leg.first + share * (leg.last - leg.first))
+        return round(leg.first + (t_ns - leg.start_ns) * leg.steps_per_ns)
 
     def feedback(self, t_ns: int) -> int:
         return self.command(t_ns - self.LAG_NS)
@@ -267,7 +267,9 @@ class SheetDrive:
         start_ns = t_ns + 2 * NS_PER_MS
         first = self.command(start_ns)
         self._cut(start_ns)
-        self._legs.append(Leg(start_ns, start_ns + abs(target - first) * NS_PER_S // speed, first, target))
+        duration_ns = abs(target - first) * NS_PER_S // speed
+        steps_per_ns = (target - first) / duration_ns if duration_ns else 0.0
+        self._legs.append(Leg(start_ns, start_ns + duration_ns, first, target, steps_per_ns))
         self._homing = self.at_home = False
 
     def halt(self, t_ns: int) -> None:
