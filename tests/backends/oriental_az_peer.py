@@ -90,7 +90,7 @@ class Script:
 
 
 class Leg(NamedTuple):
-    """One motion at `steps_per_ns` from `first` on; at `end_ns` it stands at `last`, whether it was planned so or not."""
+    """One motion at `steps_per_ns` from `first` on; from `end_ns` on it stands at `last`, as planned or not."""
 
     start_ns: int
     end_ns: int

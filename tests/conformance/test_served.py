@@ -79,15 +79,8 @@ def test_a_second_host_is_turned_away():
             second.open()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "moves_each_axis_its_own_way",
-        "stamps_the_instant_of_the_pose",
-        "a_stop_ends_the_motion_and_the_move",
-        "an_unreferenced_axis_refuses_absolute_moves",
-    ],
-)
+@pytest.mark.ports
+@pytest.mark.parametrize("name", STAGE)
 def test_a_chain_of_three_controllers_on_a_pseudo_terminal(name):
     with served_stage_bench("pty", file=CHAINED) as bench:
         STAGE[name](bench)

@@ -19,18 +19,23 @@ from microdrivers.rig import build_rig
 from tests.conformance.bench import Bench, served
 from tests.fakes.analogue_bench import module_behind
 
+_PATIENT_S = 1.0
 HOME = {"x": 0.0, "y": 0.0, "z": 0.0}
 
 
 @dataclass
 class FineStageBench(Bench):
-    """A fine stage; the fields are those of a `StageBench`. `power_cycle()` switches one of its drives off and on."""
+    """A fine stage; the fields are those of a `StageBench`.
+
+    `power_cycle()` switches one of its drives off and on, `heartbeat_s` is the interval of the drives' heartbeats.
+    """
 
     stage: FineStage
     clock: Clock
     truth: Callable[[str, int], float]
     noise_um: float = 0.1
     pose_rate_hz: float = 100.0
+    heartbeat_s: float = 0.1
     home: Mapping[str, float] = field(default_factory=lambda: dict(HOME))
     power_cycle: Callable[[], None] | None = None
     silence: Callable[[], AbstractContextManager[None]] | None = None
@@ -68,7 +73,9 @@ def bring_home(stage: FineStage) -> None:
     stage.clock.sleep(0.2)  # until the servos' lag has died out
 
 
-def _fine_stage_bench(stage: FineStage, clock: Clock, simulation: Any, *, pose_rate_hz: float) -> FineStageBench:
+def _fine_stage_bench(
+    stage: FineStage, clock: Clock, simulation: Any, *, pose_rate_hz: float, heartbeat_s: float
+) -> FineStageBench:
     bring_home(stage)
     axes = simulation.world.fine_stage_axes[stage.name]
     drives = simulation.emulations[stage.name].devices
@@ -77,6 +84,7 @@ def _fine_stage_bench(stage: FineStage, clock: Clock, simulation: Any, *, pose_r
         clock,
         truth=lambda axis, t_ns: axes[axis].position_at(t_ns),
         pose_rate_hz=pose_rate_hz,
+        heartbeat_s=heartbeat_s,
         power_cycle=lambda: drives["y"].power_cycle(clock.now_ns()),
     )
 
@@ -126,7 +134,7 @@ def fine_stage_bench(driver: type[Any] | None = None, *, seed: int = 3) -> Itera
         rig.devices["probe_stage"] = driver("probe_stage", settings, clock=rig.clock, bus=rig.bus)
     with rig:
         stage = rig.device("probe_stage", FineStage)
-        yield _fine_stage_bench(stage, rig.clock, rig.simulation, pose_rate_hz=100.0)
+        yield _fine_stage_bench(stage, rig.clock, rig.simulation, pose_rate_hz=100.0, heartbeat_s=0.1)
 
 
 @contextmanager
@@ -153,13 +161,15 @@ def served_fine_stage_bench(
     Its heartbeats are slow: a computer that runs tests, drives and host at once may be late for faster ones.
     """
     data = yaml.safe_load((file or shipped_rig()).read_text(encoding="utf-8"))
-    data["devices"]["probe_stage"]["heartbeat_ms"] = 1000
+    data["devices"]["probe_stage"]["heartbeat_ms"] = round(1000 * _PATIENT_S)
     with tempfile.TemporaryDirectory() as folder:
         patient = Path(folder) / "patient.yaml"
         patient.write_text(yaml.safe_dump(data), encoding="utf-8")
         with served(transport, "probe_stage", can_interface=can_interface, file=patient) as (rig, serving):
             stage = rig.device("probe_stage", FineStage)
-            yield _fine_stage_bench(stage, rig.clock, serving.simulation, pose_rate_hz=pose_rate_hz)
+            yield _fine_stage_bench(
+                stage, rig.clock, serving.simulation, pose_rate_hz=pose_rate_hz, heartbeat_s=_PATIENT_S
+            )
 
 
 @contextmanager
