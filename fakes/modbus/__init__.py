@@ -1,5 +1,6 @@
 """The Modbus side of emulated devices, whatever they are: an RTU slave, and a TCP gateway in front of one."""
 
+from microdrivers.fakes.modbus.attachment import SlaveLine, attach_slave
 from microdrivers.fakes.modbus.functions import (
     Function,
     ModbusException,
@@ -17,8 +18,10 @@ __all__ = [
     "ModbusDevice",
     "ModbusException",
     "RtuSlave",
+    "SlaveLine",
     "SlaveTiming",
     "TcpGateway",
+    "attach_slave",
     "crc16",
     "diagnose",
     "frame",

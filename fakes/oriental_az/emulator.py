@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import pydantic
 
 from microdrivers.core.errors import ConfigError, UnsupportedError
-from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator, Endpoint, ServeRequest
-from microdrivers.fakes.modbus import TcpGateway
+from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
+from microdrivers.fakes.modbus import SlaveLine, attach_slave
 from microdrivers.fakes.oriental_az.drive import AzDrive
 from microdrivers.fakes.oriental_az.port import az_port
 from microdrivers.fakes.oriental_az.register_map import BYTE_WORD_ORDER
-from microdrivers.fakes.wire import Wire, WireEmulator, forget_wire, register_wire, serve_wire
 from microdrivers.fakes.world.axis import Axis
-
-_NETWORK_BAUDRATE, _NETWORK_BITS_PER_BYTE = 10**9, 8
-"""Next to the line behind the gateway, bytes on a network take no time."""
 
 
 @runtime_checkable
@@ -28,23 +23,17 @@ class ZoomWorld(Protocol):
     zoom_axis: Axis
 
 
-class _Connection(pydantic.BaseModel, extra="ignore", frozen=True):
-    """The RS-485 line; with framing `tcp`, the one behind the gateway."""
+class _Line(SlaveLine):
+    """The rates and, from the factory, the parity of the drive."""
 
-    framing: Literal["rtu", "tcp"] = "rtu"
     baudrate: Literal[9600, 19200, 38400, 57600, 115200, 230400] = 115200
     parity: Literal["N", "E", "O"] = "E"
-    stopbits: Literal[1, 2] = 1
-
-    @property
-    def bits_per_byte(self) -> int:
-        return 9 + self.stopbits + (self.parity != "N")
 
 
 class _Settings(pydantic.BaseModel, extra="ignore", frozen=True):
     """The part of the rig file's section that the drive itself is set to."""
 
-    connection: _Connection
+    connection: _Line
     unit_id: int = pydantic.Field(default=1, ge=1, le=31)
     word_order: Literal["high-first", "low-first"] = "high-first"
     byte_order: Literal["big", "little"] = "big"
@@ -79,26 +68,7 @@ def _attach(request: EmulationRequest) -> Emulation:
         bits_per_byte=connection.bits_per_byte,
         seed=request.seed,
     )
-    network = connection.framing == "tcp"
-    emulator: WireEmulator = TcpGateway(port) if network else port
-    wire = Wire(
-        emulator,
-        clock=request.clock,
-        seed=request.seed,
-        baudrate=_NETWORK_BAUDRATE if network else connection.baudrate,
-        bits_per_byte=_NETWORK_BITS_PER_BYTE if network else connection.bits_per_byte,
-    )
-    url = register_wire(request.name, wire)
-
-    def serve(where: ServeRequest) -> Endpoint:
-        return serve_wire(request.name, wire, request.clock, replace(where, transport="tcp") if network else where)
-
-    return Emulation(
-        overrides={"connection": {"port": url}},
-        close=lambda: forget_wire(request.name, wire),
-        wire_log=wire.log,
-        serve=serve,
-    )
+    return attach_slave(request, port, connection)
 
 
 def _parse(name: str, settings: Mapping[str, Any]) -> _Settings:

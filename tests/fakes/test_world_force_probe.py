@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from microdrivers.core.units import NS_PER_S
-from microdrivers.fakes.modbus_analogue import ForceProbe
+from microdrivers.fakes.world.force_probe import ForceProbe
 
 DENSITY, BANDWIDTH_HZ = 0.07, 30.0
 

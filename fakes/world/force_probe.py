@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.units import NS_PER_S
+from microdrivers.devices.drivers import EmulationRequest
+from microdrivers.fakes.world.settings import ForceWorld
 
 _NS_PER_MIN = 60 * NS_PER_S
+
+
+@runtime_checkable
+class WorldWithForces(Protocol):
+    """What a world must have for a probe. Noise, drift and zero are those of its `settings.force`, if any."""
+
+    def force_uN(self, sensor: str, t_ns: int) -> float:
+        """True force along a sensor's axis."""
 
 
 class ForceProbe:
@@ -71,3 +83,42 @@ class ForceProbe:
         self._present_noise_uN = kept * self._present_noise_uN + fresh
         self._noise_at_ns = t_ns
         return self._present_noise_uN
+
+
+def probe_of(
+    request: EmulationRequest,
+    *,
+    zero_V: float,
+    sensitivity_uN_per_V: float,
+    output_V: tuple[float, float],
+    bandwidth_hz: float,
+    delay_ns: int = 0,
+) -> ForceProbe:
+    """The probe of a device in its world, which feels what pressed on it `delay_ns` ago; otherwise see `ForceProbe`.
+
+    Raises:
+        UnsupportedError: the world has no forces.
+    """
+    world = request.world
+    if not isinstance(world, WorldWithForces):
+        raise UnsupportedError(
+            f"the world {type(world).__name__} has no forces",
+            remedy="choose a world with tools that can touch something, such as `microscope`",
+            device=request.name,
+        )
+    own = getattr(getattr(world, "settings", None), "force", None)
+    imperfections = own if isinstance(own, ForceWorld) else ForceWorld()
+    return ForceProbe(
+        lambda t_ns: world.force_uN(request.name, t_ns - delay_ns),
+        zero_V=zero_V,
+        sensitivity_uN_per_V=sensitivity_uN_per_V,
+        output_V=output_V,
+        noise_uN_per_sqrt_Hz=imperfections.noise_uN_per_sqrt_Hz.get(
+            request.name, imperfections.default_noise_uN_per_sqrt_Hz
+        ),
+        bandwidth_hz=bandwidth_hz,
+        drift_uN_per_min=imperfections.drift_uN_per_min,
+        zero_spread_uN=imperfections.zero_spread_uN,
+        seed=request.seed,
+        start_ns=request.clock.now_ns(),
+    )
