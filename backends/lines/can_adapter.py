@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
 from microdrivers.backends.lines.can_listeners import CanCounters
+from microdrivers.backends.lines.ports import OPEN_REMEDIES
 from microdrivers.backends.lines.settings import CanConnection
 from microdrivers.core.clock import Clock, utc_now
 from microdrivers.core.errors import ConfigError, LinkError, LinkLost, LinkTimeout, UnsupportedError
@@ -30,12 +31,9 @@ _BUS_OFF = 0x40
 
 _QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
 
-_REMEDIES = {
+_REMEDIES = OPEN_REMEDIES | {  # an adapter may be a serial port
     errno.ENODEV: "there is no such interface: check its name (ip -brief link); without hardware use --fake",
-    errno.ENOENT: "check the cable and the port's name (ls -l /dev/serial/by-id); without hardware use --fake",
-    errno.EACCES: "you may not open it: add yourself to the group that owns it (often dialout) and log in again",
     errno.EPERM: "you may not open it: ask for the right to use CAN interfaces",
-    errno.EBUSY: "another program, or another device of this rig, uses it: close it first",
     errno.EAFNOSUPPORT: "this computer's kernel knows no CAN: load its modules (modprobe can can_raw), or use slcan",
 }
 _LOST_REMEDY = "check the adapter's cable and the bus, then close and open the rig again"

@@ -27,13 +27,14 @@ _MOST_WAITING = 65536
 _CONNECT_TIMEOUT_S = 2.0
 _TCP = "socket://"
 
-_OPEN_REMEDIES = {
+OPEN_REMEDIES = {
     errno.ENOENT: "check the cable and the port's name (ls -l /dev/serial/by-id); without hardware use --fake",
     errno.EACCES: "you may not open the port: add yourself to the group that owns it (often dialout) and log in again",
     errno.EBUSY: "another program, or another device of this rig, uses the port: close it first",
     errno.EAGAIN: "another program uses the port: close it first",
     errno.ECONNREFUSED: "nobody listens there: check the address, and that the device or `microdrivers serve` runs",
 }
+"""What to do about a port that cannot be opened, by the operating system's error number."""
 
 
 class Port(Protocol):
@@ -151,7 +152,7 @@ def open_port(wanted: SerialConnection, clock: Clock) -> Port:
         )  # fmt: skip
     except (OSError, ValueError) as error:  # SerialException is an OSError
         code = getattr(error, "errno", None) or _errno_in(str(error))
-        remedy = _OPEN_REMEDIES.get(code or 0, "check the port's name and settings in the rig file")
+        remedy = OPEN_REMEDIES.get(code or 0, "check the port's name and settings in the rig file")
         raise LinkLost(f"cannot open port {wanted.port}: {error}", remedy=remedy, moved="no") from error
     return DescriptorPort(opened.fileno(), opened.write, opened.close) if has_descriptor else PyserialPort(opened)
 
@@ -169,4 +170,4 @@ def _open_tcp(wanted: SerialConnection) -> Port:
 
 def _errno_in(text: str) -> int | None:
     """Pyserial hides the errno of a failed open in its message."""
-    return next((code for code in _OPEN_REMEDIES if f"[Errno {code}]" in text), None)
+    return next((code for code in OPEN_REMEDIES if f"[Errno {code}]" in text), None)

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import pydantic
 
-from microdrivers.core.errors import ConfigError
 from microdrivers.devices.drivers import Emulation, EmulationRequest, Endpoint, ServeRequest
 from microdrivers.fakes.can import Medium, forget_medium, shared_medium
 from microdrivers.fakes.canopen.node import CanOpenNode
@@ -76,20 +75,3 @@ def attach_nodes(
         medium=medium,
         devices=devices,
     )
-
-
-def parse_settings(request: EmulationRequest, model: type[SettingsT], *, remedy: str) -> SettingsT:
-    """The part of a device's settings that the emulator is set to.
-
-    Raises:
-        ConfigError: the device cannot be set to that.
-    """
-    try:
-        return model.model_validate(dict(request.settings))
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(
-            f"{request.name}: the emulated device cannot be set to {first['input']!r}: {first['msg']}",
-            remedy=remedy,
-            key=".".join(str(part) for part in first["loc"]),
-        ) from error

@@ -9,10 +9,11 @@ import pydantic
 
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
-from microdrivers.fakes.canopen.attachment import Connection, attach_nodes, parse_settings
+from microdrivers.fakes.canopen.attachment import Connection, attach_nodes
 from microdrivers.fakes.cia402.drive import ServoDrive
 from microdrivers.fakes.cia402.motion import AxisSpec, Motion
 from microdrivers.fakes.cia402.objects import HOMING_METHODS
+from microdrivers.fakes.rig_section import parse_settings
 from microdrivers.fakes.world.axis import Axis
 from microdrivers.fakes.world.settings import ToolsWorld
 

@@ -8,8 +8,9 @@ import pydantic
 
 from microdrivers.core.units import seconds_to_ns
 from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
-from microdrivers.fakes.canopen.attachment import Connection, attach_nodes, parse_settings
+from microdrivers.fakes.canopen.attachment import Connection, attach_nodes
 from microdrivers.fakes.cia404.amplifier import Amplifier, InputSpec
+from microdrivers.fakes.rig_section import parse_settings
 from microdrivers.fakes.world.force_probe import probe_of
 
 _ZERO_V, _SWING_V = 2.25, 2.0

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import pydantic
 
 from microdrivers.core.errors import ConfigError
@@ -13,6 +10,7 @@ from microdrivers.fakes.modbus import SlaveLine, attach_slave
 from microdrivers.fakes.modbus_analogue.models import CHANNELS, MODELS
 from microdrivers.fakes.modbus_analogue.module import AnalogueModule
 from microdrivers.fakes.modbus_analogue.port import AnaloguePort
+from microdrivers.fakes.rig_section import parse_settings
 from microdrivers.fakes.world.force_probe import probe_of
 
 
@@ -50,7 +48,7 @@ def _attach(request: EmulationRequest) -> Emulation:
         UnsupportedError: the world has no forces.
         ConfigError: a module cannot be set to what the rig file says.
     """
-    settings = _parse(request.name, request.settings)
+    settings = _parse(request)
     connection = settings.connection
     port = AnaloguePort(
         _build_module(request, settings),
@@ -88,20 +86,16 @@ def _build_module(request: EmulationRequest, settings: _Settings) -> AnalogueMod
     )
 
 
-def _parse(name: str, settings: Mapping[str, Any]) -> _Settings:
-    try:
-        parsed = _Settings.model_validate(dict(settings))
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(
-            f"{name}: the module cannot be set to {first['input']!r}: {first['msg']}",
-            remedy="use what the module's manual allows: units 1 to 247, channels 1 to 8; and framing rtu or tcp",
-            key=".".join(str(part) for part in first["loc"]),
-        ) from error
+def _parse(request: EmulationRequest) -> _Settings:
+    parsed = parse_settings(
+        request,
+        _Settings,
+        remedy="use what the module's manual allows: units 1 to 247, channels 1 to 8; and framing rtu or tcp",
+    )
     baudrates = MODELS[parsed.model].baudrates
     if parsed.connection.baudrate not in baudrates:
         raise ConfigError(
-            f"{name}: the module {parsed.model} has no baud rate {parsed.connection.baudrate}",
+            f"{request.name}: the module {parsed.model} has no baud rate {parsed.connection.baudrate}",
             remedy=f"choose one of {', '.join(map(str, sorted(baudrates)))}",
             key="connection.baudrate",
         )

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import pydantic
 
-from microdrivers.core.errors import ConfigError, UnsupportedError
+from microdrivers.core.errors import UnsupportedError
 from microdrivers.devices.drivers import Emulation, EmulationRequest, Emulator
 from microdrivers.fakes.modbus import SlaveLine, attach_slave
 from microdrivers.fakes.oriental_az.drive import AzDrive
 from microdrivers.fakes.oriental_az.port import az_port
 from microdrivers.fakes.oriental_az.register_map import BYTE_WORD_ORDER
+from microdrivers.fakes.rig_section import parse_settings
 from microdrivers.fakes.world.axis import Axis
 
 
@@ -57,7 +57,12 @@ def _attach(request: EmulationRequest) -> Emulation:
             remedy="choose a world with a zoom microscope, such as `microscope`",
             device=request.name,
         )
-    settings = _parse(request.name, request.settings)
+    settings = parse_settings(
+        request,
+        _Settings,
+        remedy="use what the drive's manual allows: 9600 to 230400 baud, units 1 to 31, word_order high-first or "
+        "low-first, byte_order big or little; and framing rtu or tcp",
+    )
     connection = settings.connection
     drive = AzDrive(request.world.zoom_axis, seed=request.seed + 1)
     drive.set_up(BYTE_WORD_ORDER, settings.byte_word_order)
@@ -69,19 +74,6 @@ def _attach(request: EmulationRequest) -> Emulation:
         seed=request.seed,
     )
     return attach_slave(request, port, connection)
-
-
-def _parse(name: str, settings: Mapping[str, Any]) -> _Settings:
-    try:
-        return _Settings.model_validate(dict(settings))
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(
-            f"{name}: the AZ drive cannot be set to {first['input']!r}: {first['msg']}",
-            remedy="use what the drive's manual allows: 9600 to 230400 baud, units 1 to 31, word_order high-first or "
-            "low-first, byte_order big or little; and framing rtu or tcp",
-            key=".".join(str(part) for part in first["loc"]),
-        ) from error
 
 
 EMULATOR = Emulator(attach=_attach)
