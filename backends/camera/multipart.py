@@ -5,7 +5,7 @@ from __future__ import annotations
 from email.message import Message
 from email.parser import BytesParser
 from email.policy import compat32
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from microdrivers.core.errors import LinkLost, ProtocolError
 
@@ -24,13 +24,6 @@ class ByteStream(Protocol):
 
     def read(self, length: int, /) -> bytes:
         """Exactly so many bytes, or fewer at the end."""
-
-
-class Part(NamedTuple):
-    """One part; header names are looked up without regard to case."""
-
-    headers: Message
-    body: bytes
 
 
 class MultipartReader:

@@ -88,7 +88,6 @@ def _integer(index: int, sub: int, bits: int, name: str, *, signed: bool) -> Ent
 
 
 DEVICE_TYPE = unsigned(0x1000, 0, 32, "device type")
-ERROR_REGISTER = unsigned(0x1001, 0, 8, "error register")
 DEVICE_NAME = text(0x1008, 0, "device name")
 SOFTWARE_VERSION = text(0x100A, 0, "software version")
 CONSUMER_HEARTBEAT = unsigned(0x1016, 1, 32, "consumer heartbeat time")
