@@ -118,7 +118,7 @@ class OpticsCalibrator:
 
     def _estimate(self, point: TrackedPoint, pose: PoseAt, zoom: ZoomSample, next_zoom: ZoomSample) -> OpticsEstimate:
         recursion = self._started(pose, point.t_ns)
-        moving = self._zoom_moves(zoom, next_zoom)
+        moving = self._zoom_moves(point.t_ns - point.dt_ns, zoom, next_zoom)
         moved = moving or self._zoom_has_moved(point.t_ns, zoom)
         defined = recursion.frames_used >= 3
         prior_error = _distance(recursion.predict(pose.x_um, pose.y_um), point) if defined else math.nan
@@ -152,9 +152,13 @@ class OpticsCalibrator:
             self._first_ns = t_ns
         return self.recursion
 
-    def _zoom_moves(self, zoom: ZoomSample, next_zoom: ZoomSample) -> bool:
+    def _zoom_moves(self, earliest_ns: int, zoom: ZoomSample, next_zoom: ZoomSample) -> bool:
+        """Whether the zoom may be moving at a frame that was taken at `earliest_ns` or later, between two samples."""
         changed = abs(next_zoom.zoom - zoom.zoom) > self.settings.zoom_still * abs(zoom.zoom)
-        return zoom.moving or next_zoom.moving or changed
+        # A motor counts as moving until it has been read at its target for good: it came to rest at the first such
+        # reading or before it, so that what is exposed after that one sees a resting zoom.
+        arrived = next_zoom.zoom == zoom.zoom and earliest_ns > zoom.t_ns + zoom.dt_ns
+        return (zoom.moving and not arrived) or next_zoom.moving or changed
 
     def _zoom_has_moved(self, t_ns: int, zoom: ZoomSample) -> bool:
         """Whether the zoom has moved since the last frame: between two frames it may come and go unseen."""

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.rig_options import RigChoice, rig_options
+from microdrivers.cli.rig_options import RigChoice, find_device, rig_options
 
 if TYPE_CHECKING:
     from microdrivers.core.errors import DeviceFault
     from microdrivers.core.samples import Sample
     from microdrivers.devices.base import Device
-    from microdrivers.rig import Rig
 
 
 @click.command(short_help="Clear a device's fault once its cause is removed.")
@@ -30,10 +29,15 @@ def clear_fault(choice: RigChoice, device: str, yes: bool) -> None:
       microdrivers clear-fault lab.yaml zoom
       microdrivers clear-fault lab.yaml sample_stage --yes
     """
+    from microdrivers.devices.force_sensor import ForceSensor
+    from microdrivers.devices.stage import Stage
+    from microdrivers.devices.zoom_motor import ZoomMotor
     from microdrivers.routines.device_state import state_text
 
     with closing(choice.build()) as rig:
-        found = _find(rig, device)
+        found = find_device(
+            rig, device, (Stage, ZoomMotor, ForceSensor), unsuitable="is a camera and has no fault to clear"
+        )
         found.open()
         sample, fault = _look(found)
         if fault is None:
@@ -46,18 +50,6 @@ def clear_fault(choice: RigChoice, device: str, yes: bool) -> None:
             click.confirm("Is its cause removed, and is the way free?", abort=True, err=True)
         found.clear_fault()
         click.echo(f"{found.name}: fault cleared; now at {state_text(found, found.read())}")
-
-
-def _find(rig: Rig, name: str) -> Device[Any]:
-    from microdrivers.core.errors import UnsupportedError
-    from microdrivers.devices.camera import Camera
-
-    device = rig.devices.get(name)
-    if device is None or isinstance(device, Camera):
-        known = [other for other, each in rig.devices.items() if not isinstance(each, Camera)]
-        found = "is no device of this rig" if device is None else "is a camera and has no fault to clear"
-        raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(known) or 'none'}")
-    return device
 
 
 def _look(device: Device[Any]) -> tuple[Sample | None, DeviceFault | None]:

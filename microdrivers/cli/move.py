@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.rig_options import RigChoice, rig_options
+from microdrivers.cli.rig_options import RigChoice, find_device, rig_options
 
 if TYPE_CHECKING:
     from microdrivers.devices.stage import Stage
@@ -47,12 +47,13 @@ def move(choice: RigChoice, device: str, relative: bool, retract: bool, **option
       microdrivers move lab.yaml probe_stage --retract
     """
     from microdrivers.core.errors import NotReferenced
+    from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
     from microdrivers.routines.device_state import state_text
 
     given = {name: value for name, value in options.items() if value is not None}
     with closing(choice.build()) as rig:
-        stage_or_zoom = _find(rig, device)
+        stage_or_zoom = find_device(rig, device, (Stage, ZoomMotor), unsuitable="cannot move")
         _check_options(stage_or_zoom, given, retract)
         stage_or_zoom.open()
         try:
@@ -65,19 +66,6 @@ def move(choice: RigChoice, device: str, relative: bool, retract: bool, **option
         except NotReferenced as error:
             error.remedy = f"make sure that the way is free, then: {_reference_command(choice, stage_or_zoom, given)}"
             raise
-
-
-def _find(rig: Rig, name: str) -> Stage[Any] | ZoomMotor:
-    from microdrivers.core.errors import UnsupportedError
-    from microdrivers.devices.stage import Stage
-    from microdrivers.devices.zoom_motor import ZoomMotor
-
-    device = rig.devices.get(name)
-    if isinstance(device, Stage | ZoomMotor):
-        return device
-    movable = [known for known, each in rig.devices.items() if isinstance(each, Stage | ZoomMotor)]
-    found = "is no device of this rig" if device is None else "cannot move"
-    raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(movable) or 'none: nothing can move'}")
 
 
 def _check_options(device: Stage[Any] | ZoomMotor, given: dict[str, float], retract: bool) -> None:

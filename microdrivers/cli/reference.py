@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from microdrivers.cli.progress import TerminalProgress
-from microdrivers.cli.rig_options import RigChoice, rig_options
+from microdrivers.cli.rig_options import RigChoice, find_device, rig_options
 
 if TYPE_CHECKING:
     from microdrivers.core.samples import DeviceEvent
@@ -52,19 +52,16 @@ def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool
 
 
 def _find(rig: Rig, choice: RigChoice, name: str | None) -> Stage[Any] | ZoomMotor:
-    from microdrivers.core.errors import ConfigError, UnsupportedError
+    from microdrivers.core.errors import ConfigError
     from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
 
     section = rig.file.microscope
     if name is None and section is None:
         raise ConfigError("the rig file names no sample stage", file=str(choice.file), remedy="add --device NAME")
-    device = rig.devices.get(name or (section.sample_stage if section else ""))
-    if isinstance(device, Stage | ZoomMotor):
-        return device
-    known = [other for other, each in rig.devices.items() if isinstance(each, Stage | ZoomMotor)]
-    found = "is no device of this rig" if device is None else "has no reference"
-    raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(known) or 'none: nothing can move'}")
+    wanted = name or (section.sample_stage if section else "")
+    device: Stage[Any] | ZoomMotor = find_device(rig, wanted, (Stage, ZoomMotor), unsuitable="has no reference")
+    return device
 
 
 def _checked_axes(device: Stage[Any] | ZoomMotor, axes: str | None) -> list[str]:

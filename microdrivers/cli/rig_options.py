@@ -75,3 +75,19 @@ def rig_options(command: Callable[..., None]) -> Callable[..., None]:
         command(RigChoice(rig, fake, seed, world, wire_log, wire_replay), **others)
 
     return with_choice
+
+
+def find_device(rig: Rig, name: str, kinds: tuple[type[Any], ...], *, unsuitable: str) -> Any:
+    """The device of that name, if it is of one of these kinds; `unsuitable` says what another one lacks.
+
+    Raises:
+        UnsupportedError: there is none; the remedy names those that there are.
+    """
+    from microdrivers.core.errors import UnsupportedError
+
+    device = rig.devices.get(name)
+    if isinstance(device, kinds):
+        return device
+    known = [other for other, each in rig.devices.items() if isinstance(each, kinds)]
+    found = "is no device of this rig" if device is None else unsuitable
+    raise UnsupportedError(f"{name!r} {found}", remedy=f"name one of {', '.join(known) or 'none: there is none'}")

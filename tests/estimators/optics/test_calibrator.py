@@ -77,6 +77,42 @@ def test_a_zoom_that_comes_back_between_two_frames_is_flushed_too():
     assert [estimate.valid for estimate in found] == [False]
 
 
+@pytest.mark.parametrize(
+    ("frame_ns", "next_zoom", "moves"),
+    [
+        (5_000_000, 1.5, False),  # after the first reading at the target
+        (1_500_000, 1.5, True),  # within that reading's own uncertainty
+        (5_000_000, 1.5004, True),  # it was not there for good
+    ],
+)
+def test_a_frame_after_the_first_reading_at_the_target_sees_a_resting_zoom(frame_ns, next_zoom, moves):
+    tracker = Exact()
+    calibrator = OpticsCalibrator(tracker)
+    play(calibrator, tracker, 10, lambda number: 1.0)
+    start_ns = 10 * PERIOD_NS
+    tracker.scale = 0.3
+
+    def zoom(t_ns, reading, moving):
+        return ZoomSample(
+            t_ns=start_ns + t_ns, dt_ns=2_000_000, device="z", zoom=reading, position_steps=0, moving=moving,
+            on_target=not moving, referenced=True,
+        )  # fmt: skip
+
+    def pose(t_ns):
+        x_um, y_um = circle(10)
+        return XYThetaSample(t_ns=start_ns + t_ns, device="s", x_um=x_um, y_um=y_um, theta_deg=0.0, moving=True,
+                             on_target=False, referenced=True)  # fmt: skip
+
+    frame = Frame(t_ns=start_ns + frame_ns, device="c", seq=10, image=None, exposure_ms=1.0, frame_id=10,
+                  principal_point_px=(0.0, 0.0))  # fmt: skip
+    found = []
+    for sample in (
+        pose(0), zoom(0, 1.5, True), frame, pose(15_000_000), zoom(15_000_000, next_zoom, False),
+    ):  # fmt: skip
+        found += [e for e in calibrator.update(sample) if isinstance(e, OpticsEstimate)]
+    assert [estimate.zoom_moving for estimate in found] == [moves]
+
+
 def test_frames_beyond_the_number_asked_for_are_ignored():
     tracker = Exact()
     assert len(play(OpticsCalibrator(tracker, frames=12), tracker, 40, lambda number: 1.0)) == 12
