@@ -8,9 +8,12 @@ from typing import NamedTuple
 from microdrivers.backends.canopen import objects
 from microdrivers.backends.canopen.emergency import EMERGENCY_ID, Emergency, decode_emergency
 from microdrivers.backends.canopen.heartbeat import NMT_ID, Heartbeats, HeartbeatWatch, NmtCommand
-from microdrivers.backends.canopen.sdo import SdoClient
-from microdrivers.backends.lines.can_line import CanLine, Listening
+from microdrivers.backends.canopen.sdo import REPLY_ID, REQUEST_ID, SdoClient
+from microdrivers.backends.lines.can_line import CanLine, Listening, Received
 from microdrivers.core.errors import ConfigError, LinkTimeout
+
+_ASK_DEVICE_TYPE = bytes.fromhex("4000100000000000")
+_SECOND_ANSWER_S = 0.02
 
 
 class Identity(NamedTuple):
@@ -137,6 +140,19 @@ class CanopenNode:
         """Have the node react if it does not hear that of `host_id` for so long; 0 ms ends it."""
         self.sdo.write(objects.CONSUMER_HEARTBEAT, host_id << 16 | timeout_ms)
 
+    def require_alone(self, *, key: str) -> None:
+        """Make sure that no two nodes have this id: both would do what one is told, and their answers would be mixed.
+
+        Raises:
+            ConfigError: two answer; `key` is that of the node's id in the rig file.
+        """
+        answering = self._count_answers()
+        if answering > 1 and (answering := self._count_answers()) > 1:  # one of them may have been late
+            raise ConfigError(
+                f"{answering} nodes answer as node {self.id} on CAN bus {self._line.connection.channel}", key=key,
+                remedy="give every node on the bus its own id, at its switches or with the maker's program",
+            )  # fmt: skip
+
     def identify(self) -> Identity:
         """Ask the node who it is. A node that was stopped (NMT) does not answer and is woken once.
 
@@ -154,6 +170,17 @@ class CanopenNode:
             revision=read(objects.REVISION) or 0, serial_number=read(objects.SERIAL_NUMBER) or 0,
             name=read(objects.DEVICE_NAME) or "", software=read(objects.SOFTWARE_VERSION) or "",
         )  # fmt: skip
+
+    def _count_answers(self) -> int:
+        """How many answer a question for the device type."""
+        answers: list[Received] = []
+        listening = self._line.listen(REPLY_ID + self.id, answers.append)
+        try:
+            self._line.send(REQUEST_ID + self.id, _ASK_DEVICE_TYPE)
+            self._line.wait(self._line.clock.event(), _SECOND_ANSWER_S)
+        finally:
+            listening.cancel()
+        return sum(answer.data[1:4] == _ASK_DEVICE_TYPE[1:4] for answer in answers)
 
     def _hear_heartbeat(self, state: int) -> None:
         self.state = state

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 from microdrivers.backends.canopen.aborts import OUT_OF_MEMORY, TIMED_OUT, TOGGLE_BIT, SdoAbort
@@ -34,6 +35,10 @@ _MARKERS = ((0x1000, 0), (0x1001, 0), (0x1018, 0))
 """Mandatory objects, any of which shows that all older requests have been answered."""
 
 _HOLD_S = 5.0
+_READING, _WRITING = "reading", "writing"
+_UPLOAD_HEAD, _NO_DATA = bytes([_UPLOAD]), bytes(4)
+
+_Accept = Callable[[bytes], bool]
 
 
 class SdoClient:
@@ -49,6 +54,7 @@ class SdoClient:
     def __init__(self, line: CanLine, node_id: int, *, timeout_s: float, name: str) -> None:
         self._line = line
         self._name = name
+        self._transfer_name = f"{name}: a transfer"
         self._timeout_s = timeout_s
         self._request_id = REQUEST_ID + node_id
         self._reply_id = REPLY_ID + node_id
@@ -64,7 +70,15 @@ class SdoClient:
         Raises:
             SdoAbort: the node refuses. LinkTimeout: it is silent. ProtocolError: it answers something else.
         """
-        data = self._sized(entry, *self._upload(entry.index, entry.sub, entry))
+        data, sized = self._transfer(self._upload, entry.index, entry.sub, _READING, entry)
+        length = entry.bits // 8
+        if not sized and length:
+            data = data[:length]
+        if length and len(data) != length:
+            raise ProtocolError(
+                f"{self._name}: {entry} has {len(data)} bytes, not {length}", received=data,
+                remedy="check that it is the device of the rig file",
+            )  # fmt: skip
         return entry.decode(data)
 
     def read_optional(self, entry: Entry[Value]) -> Value | None:
@@ -84,29 +98,12 @@ class SdoClient:
 
     def upload(self, index: int, sub: int) -> bytes:
         """The bytes of an object; 4 of a shorter one if the node does not say how many are valid."""
-        data, _ = self._upload(index, sub, None)
+        data, _ = self._transfer(self._upload, index, sub, _READING)
         return data
 
     def download(self, index: int, sub: int, data: bytes) -> None:
         """Write the bytes of an object."""
-
-        def talk(ask: _Ask) -> None:
-            mux = _mux(index, sub)
-            if 1 <= len(data) <= 4:
-                first = bytes([_DOWNLOAD | (4 - len(data)) << 2 | _EXPEDITED | _SIZE_SAID])
-                ask(first + mux + data.ljust(4, b"\0"), _answers(_DOWNLOADED, mux))
-                return
-            ask(bytes([_DOWNLOAD | _SIZE_SAID]) + mux + len(data).to_bytes(4, "little"), _answers(_DOWNLOADED, mux))
-            toggle = 0
-            for start in range(0, max(len(data), 1), 7):
-                part = data[start : start + 7]
-                last = _LAST if start + 7 >= len(data) else 0
-                head = bytes([_NEXT_DOWNLOAD | toggle | (7 - len(part)) << 1 | last])
-                reply = ask(head + part.ljust(7, b"\0"), _segment(_DOWNLOADED_SEGMENT, mux))
-                self._check_toggle(reply, toggle, index, sub)
-                toggle ^= _TOGGLE
-
-        self._transfer(index, sub, "writing", None, talk)
+        self._transfer(partial(self._download, data), index, sub, _WRITING)
 
     def request_write(self, entry: Entry[Value], value: Value) -> None:
         """Send the request to write an entry of 1 to 4 bytes past whatever is under way, and await no reply: a stop.
@@ -119,61 +116,64 @@ class SdoClient:
 
     # ------------------------------------------------------------------ inside
 
-    def _upload(self, index: int, sub: int, entry: Entry[Any] | None) -> tuple[bytes, bool]:
+    def _upload(self, index: int, sub: int) -> tuple[bytes, bool]:
         """The bytes of an object, and whether the node says how many they are."""
+        mux = _mux(index, sub)
+        reply = self._ask(_UPLOAD_HEAD + mux + _NO_DATA, _answers(_UPLOADED, mux), index, sub, _READING)
+        sized = bool(reply[0] & _SIZE_SAID)
+        if reply[0] & _EXPEDITED:
+            return (reply[4 : 8 - (reply[0] >> 2 & 3)], True) if sized else (reply[4:], False)
+        size = int.from_bytes(reply[4:8], "little") if sized else None
+        data, toggle, last = bytearray(), 0, False
+        while not last:
+            head = bytes([_NEXT_UPLOAD | toggle])
+            reply = self._ask(head + bytes(7), _segment(_UPLOADED_SEGMENT, mux), index, sub, _READING)
+            self._check_toggle(reply, toggle, index, sub)
+            data += reply[1 : 8 - (reply[0] >> 1 & 7)]
+            last, toggle = bool(reply[0] & _LAST), toggle ^ _TOGGLE
+            if len(data) > (LONGEST if size is None else size) or (last and size is not None and len(data) < size):
+                self._abort(index, sub, OUT_OF_MEMORY)
+                said = "no end" if size is None else f"{size} bytes"
+                raise ProtocolError(
+                    f"{self._name}: {object_name(index, sub)} has {len(data)} bytes and announces {said}"
+                )
+        return bytes(data), True
 
-        def talk(ask: _Ask) -> tuple[bytes, bool]:
-            mux = _mux(index, sub)
-            reply = ask(bytes([_UPLOAD]) + mux + bytes(4), _answers(_UPLOADED, mux))
-            sized = bool(reply[0] & _SIZE_SAID)
-            if reply[0] & _EXPEDITED:
-                return (reply[4 : 8 - (reply[0] >> 2 & 3)], True) if sized else (reply[4:], False)
-            size = int.from_bytes(reply[4:8], "little") if sized else None
-            data, toggle, last = bytearray(), 0, False
-            while not last:
-                reply = ask(bytes([_NEXT_UPLOAD | toggle]) + bytes(7), _segment(_UPLOADED_SEGMENT, mux))
-                self._check_toggle(reply, toggle, index, sub)
-                data += reply[1 : 8 - (reply[0] >> 1 & 7)]
-                last, toggle = bool(reply[0] & _LAST), toggle ^ _TOGGLE
-                if len(data) > (LONGEST if size is None else size) or (last and size is not None and len(data) < size):
-                    self._abort(index, sub, OUT_OF_MEMORY)
-                    said = "no end" if size is None else f"{size} bytes"
-                    raise ProtocolError(
-                        f"{self._name}: {entry or object_name(index, sub)} has {len(data)} bytes and announces {said}"
-                    )
-            return bytes(data), True
+    def _download(self, data: bytes, index: int, sub: int) -> None:
+        mux, length = _mux(index, sub), len(data)
+        if 1 <= length <= 4:
+            head = bytes([_DOWNLOAD | (4 - length) << 2 | _EXPEDITED | _SIZE_SAID])
+            self._ask(head + mux + data.ljust(4, b"\0"), _answers(_DOWNLOADED, mux), index, sub, _WRITING)
+            return
+        head = bytes([_DOWNLOAD | _SIZE_SAID])
+        self._ask(head + mux + length.to_bytes(4, "little"), _answers(_DOWNLOADED, mux), index, sub, _WRITING)
+        toggle = 0
+        for start in range(0, max(length, 1), 7):
+            part = data[start : start + 7]
+            last = _LAST if start + 7 >= length else 0
+            head = bytes([_NEXT_DOWNLOAD | toggle | (7 - len(part)) << 1 | last])
+            answers = _segment(_DOWNLOADED_SEGMENT, mux)
+            reply = self._ask(head + part.ljust(7, b"\0"), answers, index, sub, _WRITING)
+            self._check_toggle(reply, toggle, index, sub)
+            toggle ^= _TOGGLE
 
-        return self._transfer(index, sub, "reading", entry, talk)
-
-    def _sized(self, entry: Entry[Value], data: bytes, sized: bool) -> bytes:
-        length = entry.bits // 8
-        if not sized and length:
-            data = data[:length]
-        if length and len(data) != length:
-            raise ProtocolError(
-                f"{self._name}: {entry} has {len(data)} bytes, not {length}", received=data,
-                remedy="check that it is the device of the rig file",
-            )  # fmt: skip
-        return data
+    def _ask(self, request: bytes, accept: _Accept, index: int, sub: int, what: str) -> bytes:
+        reply = self._line.exchange(self._request_id, request, self._reply_id, accept, self._timeout_s).data
+        if reply[0] == _ABORT:
+            code = int.from_bytes(reply[4:8], "little")
+            raise SdoAbort(f"{self._name} refuses {what}", code=code, index=index, sub=sub)
+        return reply
 
     def _transfer(
-        self, index: int, sub: int, what: str, entry: Entry[Any] | None, talk: Callable[[_Ask], Result]
+        self, steps: Callable[[int, int], Result], index: int, sub: int, what: str, entry: Entry[Any] | None = None
     ) -> Result:
         """One transfer: alone with the node, and settled before the next one if it does not end."""
-
-        def ask(request: bytes, accept: _Accept) -> bytes:
-            reply = self._line.exchange(self._request_id, request, self._reply_id, accept, self._timeout_s).data
-            if reply[0] == _ABORT:
-                code = int.from_bytes(reply[4:8], "little")
-                raise SdoAbort(f"{self._name} refuses {what}", code=code, index=index, sub=sub)
-            return reply
-
         with self._line.clock.transaction():
-            self._line.acquire(self._lock, timeout_s=_HOLD_S, what=f"{self._name}: a transfer")
+            self._line.acquire(self._lock, timeout_s=_HOLD_S, what=self._transfer_name)
             try:
                 if self._unsettled:
                     self._settle((index, sub))
-                return talk(ask)
+                return steps(index, sub)
             except SdoAbort:
                 raise
             except LinkTimeout as error:
@@ -193,7 +193,7 @@ class SdoClient:
         if self._markers[0] == wanted:
             self._markers.rotate(-1)
         mux = _mux(*self._markers[0])
-        request = bytes([_UPLOAD]) + mux + bytes(4)
+        request = _UPLOAD_HEAD + mux + _NO_DATA
         self._line.exchange(self._request_id, request, self._reply_id, _answers(_UPLOADED, mux), self._timeout_s)
         self._unsettled = False
 
@@ -214,12 +214,8 @@ class SdoClient:
             return  # the transfer has failed already; its own error says why
 
 
-_Accept = Callable[[bytes], bool]
-_Ask = Callable[[bytes, _Accept], bytes]
-
-
 def _mux(index: int, sub: int) -> bytes:
-    return index.to_bytes(2, "little") + bytes([sub])
+    return (index | sub << 16).to_bytes(3, "little")
 
 
 def _answers(specifier: int, mux: bytes) -> _Accept:

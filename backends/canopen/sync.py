@@ -106,6 +106,7 @@ class SyncProducer:
         self._answering: tuple[Answering, ...] = ()
         self._answered = line.clock.event()
         self._turns: tuple[_Turn, ...] = ()
+        self._beat_ns = NS_PER_S
         self._timer: Timer | None = None
         self._listening = line.listen(SYNC_ID, self._hear_foreign)
 
@@ -131,12 +132,16 @@ class SyncProducer:
         Raises:
             LinkError: it cannot be sent. BusyError: others do not leave a gap.
         """
-        clock = self._line.clock
-        with self._line.holding(self._lock, timeout_s=_LOCK_S, what="a SYNC"):
-            with clock.transaction():
-                clock.sleep_until(self._quiet_until_ns())
+        line = self._line
+        line.acquire(self._lock, timeout_s=_LOCK_S, what="a SYNC")
+        try:
+            quiet_ns = self._quiet_until_ns() - line.clock.now_ns()
+            if quiet_ns > 0:  # as an exchange waits, and not asleep: our heartbeat goes on, and theirs are watched
+                line.wait(line.clock.event(), quiet_ns / NS_PER_S)
             self._await_answers()
             return self._fire(())
+        finally:
+            self._lock.release()
 
     def answered(self) -> None:
         """Told by those who take part when nothing is awaited any more."""
@@ -149,7 +154,7 @@ class SyncProducer:
         self._number += 1
         now_ns = line.clock.now_ns()
         # What has been received was on the bus before it.
-        earliest_ns = max(now_ns, line.newest_ns) + line.shortest_ns(0)
+        earliest_ns = max(now_ns, line.newest_ns) + line.shortest_ns[0]
         pulse = self._pulse = Pulse(self._number, now_ns, earliest_ns, now_ns - self.last_ns)
         for answering in self._answering:
             answering.begin(pulse, wanted=answering in wanted_by)
@@ -173,12 +178,11 @@ class SyncProducer:
                 self._line.wait(self._answered, (patient_until_ns - now_ns) / NS_PER_S)
 
     def _quiet_until_ns(self) -> int:
-        return max((each.quiet_until_ns for each in self._answering), default=0)
+        return max([each.quiet_until_ns for each in self._answering], default=0)
 
     def _beat(self) -> None:
         """One beat of the fastest stream."""
-        line, now_ns = self._line, self._line.clock.now_ns()
-        beat_ns = min((turn.period_ns for turn in self._turns), default=NS_PER_S)
+        line, now_ns, beat_ns = self._line, self._line.clock.now_ns(), self._beat_ns
         due = [turn.answering for turn in self._turns if turn.take(now_ns, beat_ns)]
         if not due:
             return
@@ -188,9 +192,12 @@ class SyncProducer:
                 answering.skip()
             return
         try:
-            with line.holding(self._lock, timeout_s=_LOCK_S, what="a SYNC"):
+            line.acquire(self._lock, timeout_s=_LOCK_S, what="a SYNC")
+            try:
                 self._await_answers()  # somebody may just have asked
                 self._fire(due)
+            finally:
+                self._lock.release()
         except (LinkError, BusyError):
             for answering in due:
                 answering.skip()
@@ -200,8 +207,9 @@ class SyncProducer:
         timer, self._timer = self._timer, None
         if timer is not None:
             timer.cancel()
+        self._beat_ns = min((turn.period_ns for turn in turns), default=NS_PER_S)
         if turns:
-            period_s = min(turn.period_ns for turn in turns) / NS_PER_S
+            period_s = self._beat_ns / NS_PER_S
             name = f"CAN {self._line.connection.channel} SYNC"
             self._timer = self._line.clock.every(period_s, self._beat, name=name)
 

@@ -83,6 +83,8 @@ class SyncedPdos:
         self.skipped = 0
         self._line = line
         self._cob_ids = tuple(cob_ids)
+        self._size = len(self._cob_ids)
+        self._gap_ns = _INTERFRAME_BITS * NS_PER_S // line.connection.bitrate
         self._on_set = on_set
         self._on_lost = on_lost
         self._producer = line.service(SyncProducer)
@@ -232,21 +234,23 @@ class SyncedPdos:
         return None
 
     def _hear(self, received: Received) -> None:
+        cob_id, _, t_ns, dt_ns = received
         with self._lock:
             if not self._counting:
-                self._ask_for_quiet(received.cob_id)
+                self._ask_for_quiet(cob_id)
                 return
             for current in self._rounds:
-                if received.cob_id not in current.frames:
+                if cob_id not in current.frames:
                     break
             else:
                 current = None
             if current is not None:
-                if received.t_ns + received.dt_ns < current.pulse.earliest_ns:
+                if t_ns + dt_ns < current.pulse.earliest_ns:
                     return  # it was on the bus before: an answer that counts as lost
-                current.frames[received.cob_id] = received
-                if any(len(each.frames) < len(self._cob_ids) for each in self._rounds):
-                    return
+                current.frames[cob_id] = received
+                for each in self._rounds:
+                    if len(each.frames) < self._size:
+                        return
             complete, self._rounds = self._rounds, []
         if current is None:
             self._discard()  # an answer to no SYNC of ours
@@ -272,8 +276,9 @@ class SyncedPdos:
             self._quiet_until_ns = self._first_quiet_ns
 
     def _give_out(self, complete: _Round) -> None:
-        frames = tuple(complete.frames[cob_id] for cob_id in self._cob_ids)
-        newest = self._newest = SyncSet(complete.pulse.number, *self._interval(complete.pulse, frames), frames)
+        frames = tuple([complete.frames[cob_id] for cob_id in self._cob_ids])
+        t_ns, dt_ns = self._interval(complete.pulse, frames)
+        newest = self._newest = SyncSet(complete.pulse.number, t_ns, dt_ns, frames)
         for flag in self._waiting:
             flag.set()
         if complete.wanted:
@@ -282,11 +287,10 @@ class SyncedPdos:
 
     def _interval(self, pulse: Pulse, frames: Sequence[Received]) -> tuple[int, int]:
         """When the SYNC reached the nodes: not before it can have passed, nor after the first answer has begun."""
-        line = self._line
-        gap_ns = _INTERFRAME_BITS * NS_PER_S // line.connection.bitrate
-        begun_ns = min(frame.t_ns - line.shortest_ns(len(frame.data)) for frame in frames) - gap_ns
-        half_ns = max(0, begun_ns - pulse.earliest_ns) // 2
-        return pulse.earliest_ns + half_ns, half_ns + min(frame.dt_ns for frame in frames)
+        shortest_ns, earliest_ns = self._line.shortest_ns, pulse.earliest_ns
+        begun_ns = min([t_ns - shortest_ns[len(data)] for _, data, t_ns, _ in frames]) - self._gap_ns
+        half_ns = max(0, begun_ns - earliest_ns) // 2
+        return earliest_ns + half_ns, half_ns + min([dt_ns for _, _, _, dt_ns in frames])
 
     def _discard(self) -> None:
         """Give up what is awaited: from now on nobody knows which SYNC a frame answers."""

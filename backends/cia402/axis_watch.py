@@ -13,6 +13,7 @@ REST_NS = 10 * NS_PER_MS
 """An axis that holds no target counts as at rest when it has not moved for so long."""
 
 _STILL_COUNTS = 2
+_ENABLED, _AT_FAULT = State.OPERATION_ENABLED, (State.FAULT, State.FAULT_REACTION)
 _LONG_AGO_NS = -(1 << 62)
 
 
@@ -31,7 +32,7 @@ class Reading(NamedTuple):
     @property
     def at_fault(self) -> bool:
         """Whether the drive is at fault, or about to be."""
-        return self.state in (State.FAULT, State.FAULT_REACTION)
+        return state_of(self.status_word) in _AT_FAULT
 
     def has(self, bit: int) -> bool:
         """Whether the status word has this bit."""
@@ -112,20 +113,22 @@ class AxisWatch:
 
     def see(self, t_ns: int, reading: Reading) -> None:
         """Take in what the drive reported at `t_ns`."""
-        if self._rest_position is None or abs(reading.position - self._rest_position) > self._still:
+        status_word, position, mode = reading
+        if self._rest_position is None or abs(position - self._rest_position) > self._still:
             if self._rest_position is not None:  # the first reading ever shows an axis at rest, as far as anybody knows
                 self._rest_since_ns = t_ns
-            self._rest_position = reading.position
+            self._rest_position = position
         at_rest = t_ns - self._rest_since_ns >= REST_NS
-        holds = reading.state is State.OPERATION_ENABLED
-        if self._enabled and not holds and reading.state is not None:
+        state = state_of(status_word)
+        holds = state is _ENABLED
+        if self._enabled and not holds and state is not None:
             self.dropped = True
             self.forget_target()
-        reached = reading.has(Status.TARGET_REACHED)
-        if holds and self.target is not None and reading.mode == PROFILE_POSITION:
+        reached = bool(status_word & Status.TARGET_REACHED)
+        if holds and self.target is not None and mode == PROFILE_POSITION:
             self.moving = not (reached and self._acknowledged)
-            self.on_target = not self.moving and abs(reading.position - self.target) <= self._tolerance
-        elif holds and self._homing and reading.mode == HOMING:
+            self.on_target = not self.moving and abs(position - self.target) <= self._tolerance
+        elif holds and self._homing and mode == HOMING:
             self.moving, self.on_target = not reached, False
         else:
             self.moving, self.on_target = not at_rest, False

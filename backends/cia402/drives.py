@@ -29,12 +29,13 @@ class Drives:
 
     Args:
         line: the bus.
-        drives: by axis.
+        drives: one for each axis.
         timeout_s: how long PDOs may take.
         on_set: called with each set of a stream; `on_lost` with the identifiers missing from one.
         check: raises what stands against a move: a fault, or a drive that has gone.
 
     Attributes:
+        all: the drives, in the order of the axes.
         stops: changes before and after every stop that is sent.
     """
 
@@ -42,17 +43,13 @@ class Drives:
         self, line: CanLine, drives: Sequence[Drive], *, timeout_s: float, on_set: Callable[[SyncSet], object],
         on_lost: Callable[[Sequence[int]], object], check: Callable[[], object],
     ) -> None:  # fmt: skip
+        self.all: Sequence[Drive] = tuple(drives)
         self.by_axis: Mapping[str, Drive] = {drive.axis: drive for drive in drives}
         self.stops = 0
         self.pdos = SyncedPdos(line, [drive.status_id for drive in drives], on_set=on_set, on_lost=on_lost)
         self.clock: Clock = line.clock
         self._timeout_s = timeout_s
         self._check = check
-
-    @property
-    def all(self) -> Sequence[Drive]:
-        """The drives, in the order of the axes."""
-        return tuple(self.by_axis.values())
 
     # ------------------------------------------------------------------ looking
 
@@ -72,9 +69,10 @@ class Drives:
 
     def see(self, found: SyncSet) -> None:
         """Take in a set."""
+        t_ns = found.t_ns
         for drive, frame in zip(self.all, found.frames, strict=True):
-            drive.reading = drive.decode(frame.data)
-            drive.watch.see(found.t_ns, drive.reading)
+            drive.reading = reading = drive.decode(frame.data)
+            drive.watch.see(t_ns, reading)
 
     # ------------------------------------------------------------------ stopping
 

@@ -7,6 +7,7 @@ import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 
 from microdrivers.backends.canopen.heartbeat import Heartbeats
 from microdrivers.backends.canopen.sync import SyncProducer
@@ -17,6 +18,7 @@ from microdrivers.backends.cia402.drives import Drives
 from microdrivers.backends.cia402.guard import Guard
 from microdrivers.backends.cia402.homing import ReferenceSearch, refuse_other_order
 from microdrivers.backends.cia402.path import write_path
+from microdrivers.backends.cia402.pose import pose_sample
 from microdrivers.backends.cia402.power import reset_faults, rest, switch_off
 from microdrivers.backends.cia402.set_up import describe, identify_all, set_up
 from microdrivers.backends.cia402.settings import FineStageSettings
@@ -36,8 +38,7 @@ from microdrivers.core.samples import EventKind, FineStageSample
 from microdrivers.core.units import NS_PER_S, Range, check_range, seconds_to_ns
 from microdrivers.devices.base import DeviceInfo
 from microdrivers.devices.fine_stage import FineStage
-
-FAULT_FLAG = "FAULT"
+from microdrivers.devices.shared_bus import BusFacts
 
 _BUSY_S = 1.0
 _RETRY_S = 1.0
@@ -62,9 +63,10 @@ class Cia402FineStage(FineStage):
         super().__init__(name, clock=clock, bus=bus)
         self.settle_s = settings.settle_s
         self.retract_um = settings.retract_um
+        self.origin_um = settings.origin_um
         self.axes_in_rig = {axis: getattr(settings.axes_in_rig, axis) for axis in self.axis_names}
         self._settings = settings
-        self._line = shared_can_line(settings.connection, clock=clock)
+        self._line = shared_can_line(settings.connection, clock=clock, bus=bus)
         self._guard = Guard(tell=self._tell, faulted=self._note_fault, recover=self._recover_soon)
         timeout_s = settings.connection.timeout_s
         drives = [
@@ -114,6 +116,11 @@ class Cia402FineStage(FineStage):
     def bus_load(self) -> float:
         """Share of the bus' time that this rig's frames take, 0 to 1."""
         return self._line.load
+
+    @property
+    def bus_facts(self) -> BusFacts:
+        """The bus at present, as all devices on it see it."""
+        return self._line.facts
 
     # ------------------------------------------------------------------ life
 
@@ -246,29 +253,10 @@ class Cia402FineStage(FineStage):
         return self._sample(found)
 
     def _sample(self, found: SyncSet) -> FineStageSample:
-        drives = self._drives.all
-        x_um, y_um, z_um = (drive.map.position_um(drive.reading.position) for drive in drives if drive.reading)
-        held = [drive.watch for drive in drives if drive.watch.target is not None]
-        target_x_um, target_y_um, target_z_um = (
-            self._targets_um[drive.axis] if drive.watch.target is not None else math.nan for drive in drives
-        )
-        return FineStageSample(
-            t_ns=found.t_ns,
-            dt_ns=found.dt_ns,
-            t_source="midpoint",
-            device=self.name,
+        return pose_sample(
+            self._drives.all, found, targets_um=self._targets_um, at_fault=self._guard.at_fault, device=self.name,
             seq=self._next_seq(),
-            flags=frozenset({FAULT_FLAG} if self._guard.at_fault else ()),
-            x_um=x_um,
-            y_um=y_um,
-            z_um=z_um,
-            target_x_um=target_x_um,
-            target_y_um=target_y_um,
-            target_z_um=target_z_um,
-            moving=any(drive.watch.moving for drive in drives),
-            on_target=bool(held) and all(watch.on_target for watch in held),
-            referenced=all(drive.referenced for drive in drives),
-        )
+        )  # fmt: skip
 
     # ------------------------------------------------------------------ streaming
 
@@ -303,7 +291,7 @@ class Cia402FineStage(FineStage):
         sample = self._sample(found)
         if self.link == "lost":
             self._regain_link()
-        self.clock.deliver(lambda: self.topic.publish(sample))
+        self.clock.deliver(partial(self.topic.publish, sample))
 
     def _miss_set(self, missing: Sequence[int]) -> None:
         """Heartbeats tell whether the drives are there; without answers for long the link is lost all the same."""

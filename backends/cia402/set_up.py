@@ -75,8 +75,9 @@ def identify(drive: Drive, *, key: str) -> Identity:
 
     Raises:
         LinkTimeout: nobody answers. ProtocolError: another device does.
-        ConfigError: it is slower than the rig file says.
+        ConfigError: another node has the same id; or it is slower than the rig file says.
     """
+    drive.node.require_alone(key=f"{key}.node_id")
     sdo, identity = drive.node.sdo, drive.node.identify()
     if identity.profile != objects.PROFILE_NUMBER:
         raise ProtocolError(
@@ -132,9 +133,9 @@ def set_up(drive: Drive, *, heartbeat_ms: int, clock: Clock) -> None:
 def release(drive: Drive) -> None:
     """Have it stop watching our heartbeat and sending PDOs; its power stage is switched off already."""
     drive.forget()
+    drive.node.command(NmtCommand.PRE_OPERATIONAL)  # first: the answers behind it show that it was heard
     drive.node.consume_heartbeat(HOST_NODE_ID, 0)
     drive.node.produce_heartbeat(0, timeout_s=0)
-    drive.node.command(NmtCommand.PRE_OPERATIONAL)
 
 
 def _await_rest(drive: Drive, clock: Clock) -> None:

@@ -99,8 +99,9 @@ class FineStageSettings(DeviceSettings):
     """A fine stage.
 
     `reference_order` is the one order in which axes may be referenced: an axis that takes the tool out of harm's way
-    comes first. `axes_in_rig` says how the stage's holder is tilted against the rig, `retract_um` which way, in the
-    stage's own axes, leads away from the sample.
+    comes first. `axes_in_rig` says how the stage's holder is tilted against the rig, `origin_um` where in the rig's
+    frame the tip of the tool is when all axes are at 0, `retract_um` which way, in the stage's own axes, leads away from
+    the sample.
 
     `heartbeat_ms` is the interval of the drives' heartbeats, and how long they go on without hearing ours before they
     stop. `settle_s` is how long a move may take to settle; `reference_timeout_s` how long one axis may search.
@@ -111,6 +112,7 @@ class FineStageSettings(DeviceSettings):
     axes: FineAxes
     reference_order: tuple[AxisName, AxisName, AxisName]
     axes_in_rig: AxisDirections = AxisDirections()
+    origin_um: Triple | None = None
     retract_um: Triple | None = None
     heartbeat_ms: int = pydantic.Field(default=100, ge=10, le=10_000)
     settle_s: float = pydantic.Field(default=0.1, gt=0)

@@ -59,9 +59,13 @@ _WITH_QUICK_STOP_BIT = {
 }
 
 
+_STATES = tuple(_WITH_QUICK_STOP_BIT.get(word) or _WITHOUT_QUICK_STOP_BIT.get(word & 0x4F) for word in range(0x70))
+"""By the bits of the status word that matter; some numbers cannot come up."""
+
+
 def state_of(status_word: int) -> State | None:
     """The state that a status word shows; None if it shows none."""
-    return _WITH_QUICK_STOP_BIT.get(status_word & 0x6F) or _WITHOUT_QUICK_STOP_BIT.get(status_word & 0x4F)
+    return _STATES[status_word & 0x6F]
 
 
 def next_control_word(state: State | None) -> int | None:

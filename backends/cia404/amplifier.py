@@ -21,7 +21,6 @@ from microdrivers.backends.canopen.pdo import (
     disable_tpdo,
     tpdo_id,
 )
-from microdrivers.backends.canopen.sdo import REPLY_ID, REQUEST_ID
 from microdrivers.backends.cia404.measurement_frame import (
     PROCESS_VALUES,
     STATUS,
@@ -31,7 +30,6 @@ from microdrivers.backends.cia404.measurement_frame import (
 )
 from microdrivers.backends.cia404.physical_unit import KNOWN_UNITS, uN_per_unit
 from microdrivers.backends.cia404.settings import Cia404ForceSettings
-from microdrivers.backends.lines.can_line import CanLine, Received
 from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.devices.base import DeviceInfo
 
@@ -40,8 +38,6 @@ _ANALOGUE_INPUTS = 1 << 17
 _ANOTHER = "check connection and node_id in the rig file, and the node id switches"
 _UNIT, _DIGITS = 0x6131, 0x6132
 _COARSER_THAN_STATED = 2.0
-_ASK_DEVICE_TYPE = bytes.fromhex("4000100000000000")
-_SECOND_ANSWER_S = 0.02
 
 _TRANSMISSION = unsigned(0x1800, 2, 8, "transmission type of TPDO 1")
 _EVENT_TIMER = unsigned(0x1800, 5, 16, "event timer of TPDO 1")
@@ -59,9 +55,8 @@ class Amplifier:
 
     frame: MeasurementFrame
 
-    def __init__(self, node: CanopenNode, line: CanLine, settings: Cia404ForceSettings, *, name: str) -> None:
+    def __init__(self, node: CanopenNode, settings: Cia404ForceSettings, *, name: str) -> None:
         self._node = node
-        self._line = line
         self._sdo = node.sdo
         self._settings = settings
         self._channel = settings.channel
@@ -76,7 +71,7 @@ class Amplifier:
             UnsupportedError: it is no measuring amplifier. ConfigError: its unit or range do not fit the rig file.
             SdoAbort: it lacks what every such amplifier has. LinkError: no sound answer.
         """
-        self._check_alone()
+        self._node.require_alone(key=f"{self._name}.node_id")
         identity = self._node.identify()
         self._check_profile(identity)
         value = self._process_value()
@@ -161,22 +156,6 @@ class Amplifier:
             what = "it has no analogue inputs" if identity.profile == _PROFILE else f"its profile is {identity.profile}"
             raise UnsupportedError(
                 f"{self._node.name} is no measuring amplifier: {what} (1000h is {device_type:08X}h)", remedy=_ANOTHER
-            )
-
-    def _check_alone(self) -> None:
-        """Two nodes of the same id both answer, and their answers would be mixed."""
-        answers: list[Received] = []
-        listening = self._line.listen(REPLY_ID + self._node.id, answers.append)
-        try:
-            self._line.send(REQUEST_ID + self._node.id, _ASK_DEVICE_TYPE)
-            self._line.wait(self._line.clock.event(), _SECOND_ANSWER_S)
-        finally:
-            listening.cancel()
-        if len(answers) > 1:
-            raise ConfigError(
-                f"{len(answers)} nodes answer as node {self._node.id} on CAN bus {self._line.connection.channel}",
-                key=f"{self._name}.node_id",
-                remedy="give every node on the bus its own id, at its switches or with the maker's program",
             )
 
     def _process_value(self) -> ProcessValue:

@@ -14,6 +14,9 @@ from microdrivers.core.units import NS_PER_MS, NS_PER_S
 
 _LONGEST_FRAME_BYTES = 8
 
+_FOLLOW = 0.05
+"""How much of what is no whole period is put down to the amplifier's own clock, a frame."""
+
 
 class Measurement(NamedTuple):
     """Raw force and flags, and the interval in which it was made: `t_ns` ± `dt_ns` on the rig's clock."""
@@ -65,6 +68,7 @@ class MeasurementStream:
         self._age_half_ns = own.half_width_ns + waiting_half_ns + self._conversion_half_ns
         self._period_ns = 0
         self._newest_ns = 0
+        self._behind = 0.0
         self._synced: SyncedPdos | None = None
         self._ends: list[Callable[[], object]] = []
 
@@ -73,6 +77,7 @@ class MeasurementStream:
         self.lost = 0
         self.heard_ns = self._now_ns()
         self._newest_ns = 0
+        self._behind = 0.0
         self._period_ns = round(NS_PER_S / rate_hz)
         if not self._settings.sync:
             self._end_with(self._line.listen(self._cob_id, self._hear))
@@ -108,12 +113,22 @@ class MeasurementStream:
             return
         self.heard_ns = self._now_ns()
         if self._newest_ns:
-            # A late frame counts as lost until those behind it, which come early then, make up for it.
-            missing = round((t_ns - self._newest_ns) / self._period_ns) - 1
-            self.lost = max(0, self.lost + missing)
+            self._count_missing(t_ns - self._newest_ns)
         self._newest_ns = t_ns
         raw_uN, flags = self._decode(data)
         self._on_measurement(Measurement(raw_uN, flags, t_ns - self._age_ns, dt_ns + self._age_half_ns))
+
+    def _count_missing(self, gap_ns: int) -> None:
+        """How many periods the frames are behind their timer: whole ones are losses, the rest waited for the bus.
+
+        A late frame counts as lost until those behind it, which come early then, make up for it.
+        """
+        behind = self._behind + gap_ns / self._period_ns - 1.0
+        missing = round(behind)
+        if missing < 0:  # the count began with a late frame
+            behind, missing = behind - missing, 0
+        self.lost = missing
+        self._behind = behind + _FOLLOW * (missing - behind)
 
     def _hear_set(self, answers: SyncSet) -> None:
         measurement = self._of_set(answers)

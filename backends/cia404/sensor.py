@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from microdrivers.backends.canopen.aborts import SdoAbort
@@ -17,11 +17,12 @@ from microdrivers.backends.cia404.settings import FASTEST_HZ, MOST_LOAD, Cia404F
 from microdrivers.backends.lines.can_line import Listening, shared_can_line
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, ClockEvent, Timer
-from microdrivers.core.errors import BusyError, DeviceFault, LinkError, MicrodriversError, OutOfRange
+from microdrivers.core.errors import DeviceFault, LinkError, MicrodriversError, OutOfRange
 from microdrivers.core.samples import ForceSample, TimeSource
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, Range, check_range, seconds_to_ns
 from microdrivers.devices.base import DeviceInfo
 from microdrivers.devices.force_sensor import ForceSensor
+from microdrivers.devices.shared_bus import BusFacts
 
 _RATES_HZ = Range(0.02, FASTEST_HZ)
 _WATCH_S = 0.05
@@ -47,7 +48,7 @@ class Cia404ForceSensor(ForceSensor):
         super().__init__(name, clock=clock, bus=bus)
         self._adopt(settings)
         self._settings = settings
-        self._line = shared_can_line(settings.connection, clock=clock)
+        self._line = shared_can_line(settings.connection, clock=clock, bus=bus)
         self._node = CanopenNode(
             self._line,
             settings.node_id,
@@ -58,7 +59,7 @@ class Cia404ForceSensor(ForceSensor):
             on_silence=lambda: self._lose(f"node {settings.node_id} sends no heartbeat any more"),
             on_emergency=self._hear_emergency,
         )
-        self._amplifier = Amplifier(self._node, self._line, settings, name=name)
+        self._amplifier = Amplifier(self._node, settings, name=name)
         self._stream: MeasurementStream | None = None
         self._stream_source: TimeSource = "request" if settings.sync else "arrival"
         self._event_ms = 0
@@ -77,9 +78,19 @@ class Cia404ForceSensor(ForceSensor):
         return self._lost_frames + (self._stream.lost if self._stream is not None else 0)
 
     @property
+    def line_counters(self) -> Mapping[str, int]:
+        """What this sensor missed."""
+        return {"lost_frames": self.lost_frames}
+
+    @property
     def bus_load(self) -> float:
         """Share of the bus that is taken, by all devices on it, 0 to 1."""
         return self._line.load
+
+    @property
+    def bus_facts(self) -> BusFacts:
+        """The bus at present, as all devices on it see it."""
+        return self._line.facts
 
     # ------------------------------------------------------------------ connection
 
@@ -158,12 +169,11 @@ class Cia404ForceSensor(ForceSensor):
     # ------------------------------------------------------------------ streaming
 
     @contextmanager
-    def stream(self, rate_hz: float) -> Iterator[None]:
+    def _stream_at(self, rate_hz: float) -> Iterator[None]:
         """Have the amplifier send at `rate_hz` while the context is open; its timer takes the nearest whole period, ms.
 
         Raises:
-            OutOfRange: faster than the amplifier or the bus can. BusyError: a stream is open.
-            LinkError, SdoAbort: it could not be started.
+            OutOfRange: faster than the amplifier or the bus can. LinkError, SdoAbort: it could not be started.
         """
         self._require_open()
         check_range(rate_hz, _RATES_HZ, what="stream rate", unit="Hz", device=self.name)
@@ -175,8 +185,6 @@ class Cia404ForceSensor(ForceSensor):
             self._end_stream()
 
     def _begin_stream(self, rate_hz: float) -> None:
-        if self.streaming:
-            raise BusyError("a stream is open already", remedy="end it, or subscribe to the sensor's topic")
         load = self._settings.load_at(rate_hz)
         if load > MOST_LOAD:
             raise OutOfRange(

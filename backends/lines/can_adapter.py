@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
 from microdrivers.backends.lines.can_listeners import CanCounters
+from microdrivers.backends.lines.port_lock import PortLock
 from microdrivers.backends.lines.ports import OPEN_REMEDIES
 from microdrivers.backends.lines.settings import CanConnection
 from microdrivers.core.clock import Clock, utc_now
 from microdrivers.core.errors import ConfigError, LinkError, LinkLost, LinkTimeout, UnsupportedError
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
+from microdrivers.devices.wire_tap import CanTap
 
 if TYPE_CHECKING:
     import can
@@ -25,6 +27,8 @@ _ID_BITS = 0x7FF
 _CLOCK_STAMP_NS = 1_000
 _KERNEL_STAMP_NS = 50_000
 """An interrupt's latency and the reading of two clocks."""
+
+_READINGS = 3
 
 _BUS_OFF = 0x40
 """Class of a SocketCAN error frame (linux/can/error.h)."""
@@ -55,6 +59,7 @@ class CanAdapter:
         connection: the bus.
         clock: the rig's.
         counters: to be kept.
+        tap: is told every frame.
 
     Attributes:
         failures: exceptions of python-can and the operating system.
@@ -66,16 +71,20 @@ class CanAdapter:
         UnsupportedError: python-can is missing, or the interface exists in real time only and the clock is simulated.
     """
 
-    def __init__(self, connection: CanConnection, *, clock: Clock, counters: CanCounters) -> None:
+    def __init__(
+        self, connection: CanConnection, *, clock: Clock, counters: CanCounters, tap: CanTap | None = None
+    ) -> None:
         self._can = _python_can()
         self.failures: tuple[type[Exception], ...] = (self._can.CanError, OSError)
         self._connection = connection
         self._clock = clock
         self._counters = counters
+        self._tap = tap
         self._arrival_ns = round(connection.arrival_uncertainty_ms * NS_PER_MS)
+        self._port_lock: PortLock | None = None
         self._bus = self._open()
-        self._notifies: Callable[[Callable[[], None] | None], None] | None = getattr(self._bus, "on_arrival", None)
-        if clock.simulated and self._notifies is None:
+        emulated = hasattr(self._bus, "deliver_to")
+        if clock.simulated and not emulated:
             self.close()
             raise UnsupportedError(
                 f"{_name(connection)} is a real bus and cannot run on a simulated clock",
@@ -83,10 +92,15 @@ class CanAdapter:
             )
         self._message = self._can.Message
         self._stamps_calendar_time = connection.interface == "socketcan"
-        self.stamps_frames = self._filters_itself = self._notifies is not None or self._stamps_calendar_time
+        self._stamps_the_rigs_time = emulated
+        self.stamps_frames = self._filters_itself = emulated or self._stamps_calendar_time
+        self._stamped: can.Message | None = None
+        self._newest = Stamp(-NS_PER_S, 0)
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Hand a data frame over; waits only, and shortly, if there is no room for it."""
+        if self._tap is not None and self._tap.heard:
+            self._tap.frame(self._clock.now_ns(), "sent", cob_id, data)
         self._bus.send(self._message(arbitration_id=cob_id, data=data, is_extended_id=False), timeout=_SEND_WAIT_S)
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -97,31 +111,45 @@ class CanAdapter:
             except (ValueError, IndexError) as error:
                 self._discard_garbage(error)
             else:
+                if self._tap is not None and self._tap.heard and message is not None:
+                    self._tell(self._tap, message)
                 if message is None or not message.is_error_frame:
                     return message
-                self._note_error_frame(message)
+                self._note_error_frame(message.arbitration_id)
             timeout_s = 0.0
 
-    def notify(self, call: Callable[[], None] | None) -> None:
-        """Have the clock call whenever a frame has arrived; only on a simulated clock."""
-        if self._notifies is not None:
-            self._notifies(call)
-
     def stamp(self, message: can.Message) -> Stamp:
-        """When the frame had arrived.
+        """When the frame had arrived: later than the one before. Ask in the order in which frames are received.
 
         An emulated bus stamps on the rig's clock. A kernel stamps in calendar time: the age of the stamp is taken from
         now, so that it matters neither where that time began nor whether it was set meanwhile. Other interfaces stamp
         in python-can, or in time of their own: there the arrival counts.
         """
-        now_ns = self._clock.now_ns()
-        if self._notifies is not None:
+        if message is not self._stamped:
+            t_ns, dt_ns = self._measure(message)
+            # The order of frames is certain, the difference of two clocks is not.
+            backwards_ns = max(0, self._newest.t_ns + 1 - t_ns)
+            self._stamped, self._newest = message, Stamp(t_ns + backwards_ns, dt_ns + backwards_ns)
+        return self._newest
+
+    def _measure(self, message: can.Message) -> Stamp:
+        if self._stamps_the_rigs_time:
             return Stamp(round(message.timestamp * NS_PER_S), _CLOCK_STAMP_NS)
         if self._stamps_calendar_time:
-            age_ns = round((utc_now().timestamp() - message.timestamp) * NS_PER_S)
+            age_ns, now_ns, unsure_ns = self._age_of(message)
             if 0 <= age_ns <= NS_PER_S:
-                return Stamp(now_ns - age_ns, _KERNEL_STAMP_NS)
-        return Stamp(now_ns, self._arrival_ns)
+                return Stamp(now_ns - age_ns, max(_KERNEL_STAMP_NS, unsure_ns))
+        return Stamp(self._clock.now_ns(), self._arrival_ns)
+
+    def _age_of(self, message: can.Message) -> tuple[int, int, int]:
+        """How old a stamp in calendar time is, at which time of the rig's clock, and how far apart both were read."""
+        for _ in range(_READINGS):
+            before_ns = self._clock.now_ns()
+            age_ns = round((utc_now().timestamp() - message.timestamp) * NS_PER_S)
+            now_ns = self._clock.now_ns()
+            if now_ns - before_ns <= _KERNEL_STAMP_NS:  # else something came in between
+                break
+        return age_ns, now_ns, now_ns - before_ns
 
     def accept(self, cob_ids: Iterable[int]) -> None:
         """Let through only these identifiers where the interface itself can filter; elsewhere that saves nothing."""
@@ -134,6 +162,8 @@ class CanAdapter:
         """Give the adapter up."""
         with contextlib.suppress(*self.failures):  # it may have been unplugged
             self._bus.shutdown()
+        if self._port_lock is not None:
+            self._port_lock.close()
 
     def explain(self, error: Exception) -> LinkError:
         """What a failure means: `LinkTimeout` if the adapter may recover by itself, else `LinkLost`."""
@@ -145,11 +175,22 @@ class CanAdapter:
             )
         return LinkLost(f"{_name(self._connection)} failed: {error}", remedy=self._remedy(number, _LOST_REMEDY))
 
-    def _note_error_frame(self, message: can.Message) -> None:
+    def _tell(self, tap: CanTap, message: can.Message) -> None:
+        t_ns, data = self.stamp(message).t_ns, bytes(message.data)
+        if message.is_error_frame:
+            tap.error_frame(t_ns, message.arbitration_id, data)
+            return
+        remote = message.is_remote_frame
+        tap.frame(
+            t_ns, "received", message.arbitration_id, bytes(message.dlc) if remote else data,
+            extended=message.is_extended_id, remote=remote,
+        )  # fmt: skip
+
+    def _note_error_frame(self, error_class: int) -> None:
         self._counters.error_frames += 1
         if self._counters.error_frames == 1:
             _log.warning("%s: an error frame; look at bit rate, cable and termination", _name(self._connection))
-        if message.arbitration_id & _BUS_OFF:
+        if error_class & _BUS_OFF:
             raise OSError(errno.ENETDOWN, "the controller is bus-off")
 
     def _discard_garbage(self, error: Exception) -> None:
@@ -164,10 +205,16 @@ class CanAdapter:
     def _open(self) -> can.BusABC:
         wanted = self._connection
         try:
-            bus: can.BusABC = self._can.Bus(
-                interface=wanted.interface, channel=wanted.channel, bitrate=wanted.bitrate, ignore_config=True,
-                **wanted.options,
-            )  # fmt: skip
+            lock = PortLock(wanted.channel)  # first: opening an adapter resets it under whoever uses it
+            try:
+                bus: can.BusABC = self._can.Bus(
+                    interface=wanted.interface, channel=wanted.channel, bitrate=wanted.bitrate, ignore_config=True,
+                    **wanted.options,
+                )  # fmt: skip
+            except BaseException:
+                lock.close()
+                raise
+            self._port_lock = lock
             return bus
         except NotImplementedError as error:
             raise ConfigError(

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 from microdrivers.backends.lines.can_adapter import CanAdapter
+from microdrivers.backends.lines.can_in_process import InProcessAdapter, InProcessReceiver
 from microdrivers.backends.lines.can_listeners import (
     SILENCE_REMEDY,
+    Awaited,
     CanCounters,
     Listener,
     Listeners,
@@ -25,19 +27,19 @@ from microdrivers.backends.lines.can_listeners import (
     Upkeep,
 )
 from microdrivers.backends.lines.can_load import LoadMeter
+from microdrivers.backends.lines.can_receiving import Receiver, ThreadReceiver
 from microdrivers.backends.lines.settings import CanConnection
-from microdrivers.core.clock import Clock, ClockEvent, Timer
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock, ClockEvent
 from microdrivers.core.errors import BusyError, ConfigError, LinkError, LinkLost, LinkTimeout
-from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
-
-if TYPE_CHECKING:
-    import can
+from microdrivers.core.units import NS_PER_S
+from microdrivers.devices.shared_bus import BusFacts
+from microdrivers.devices.wire_tap import CanTap
 
 ServiceT = TypeVar("ServiceT")
 
-_RECEIVE_S = 0.1
-_LOCK_STEP_NS = NS_PER_MS
 _SHORTEST_FRAME_BITS = 44
+_MOST_BYTES = 64  # of CAN FD
 
 __all__ = ["CanLine", "Listening", "Received", "SILENCE_REMEDY", "shared_can_line"]
 
@@ -50,6 +52,8 @@ class CanLine:
     Attributes:
         counters: what has happened since it was opened.
         newest_ns: stamp of the newest frame received, ns.
+        shortest_ns: by number of bytes, the shortest time that a data frame can take on the bus.
+        tap: is told every frame that passes, if somebody listens there.
     """
 
     def __init__(self, connection: CanConnection, *, clock: Clock) -> None:
@@ -57,7 +61,11 @@ class CanLine:
         self.clock = clock
         self.counters = CanCounters()
         self.newest_ns = -1
+        self.tap: CanTap | None = None
         self._load = LoadMeter(connection.bitrate)
+        self.shortest_ns: Sequence[int] = [
+            (_SHORTEST_FRAME_BITS + 8 * length) * NS_PER_S // connection.bitrate for length in range(_MOST_BYTES + 1)
+        ]
         self._adapter: CanAdapter | None = None
         self._lost: LinkLost | None = None
         self._users = 0
@@ -68,8 +76,7 @@ class CanLine:
         self._waiting: set[ClockEvent] = set()
         self._services: dict[object, Any] = {}
         self._upkeep = Upkeep(needed=clock.simulated)
-        self._receiver: Timer | None = None
-        self._receiving_thread = 0
+        self._receiver: Receiver | None = None
 
     # ------------------------------------------------------------------ life
 
@@ -84,7 +91,7 @@ class CanLine:
                 self._end()
             if self._adapter is None:
                 self.counters = CanCounters()
-                self._begin(CanAdapter(self.connection, clock=self.clock, counters=self.counters))
+                self._begin()
             self._users += 1
 
     def close(self) -> None:
@@ -94,21 +101,23 @@ class CanLine:
             if not self._users:
                 self._end()
 
-    def _begin(self, adapter: CanAdapter) -> None:
+    def _begin(self) -> None:
+        adapter: CanAdapter
+        if self.clock.simulated:
+            adapter = InProcessAdapter(self.connection, clock=self.clock, counters=self.counters, tap=self.tap)
+            self._receiver = InProcessReceiver(self, adapter, upkeep=self._upkeep)
+        else:
+            adapter = CanAdapter(self.connection, clock=self.clock, counters=self.counters, tap=self.tap)
         self._adapter, self._lost = adapter, None
         adapter.accept(self._listeners.cob_ids)
-        if self.clock.simulated:
-            adapter.notify(self._drain)
-        else:
-            self._receiver = self.clock.call_at(
-                self.clock.now_ns(), lambda: self._receive_until_closed(adapter), name=f"CAN {self.connection.channel}"
-            )
+        if self._receiver is None:
+            self._receiver = ThreadReceiver(self, adapter, name=f"CAN {self.connection.channel}")
 
     def _end(self) -> None:
         adapter, self._adapter = self._adapter, None
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
-            receiver.cancel()
+            receiver.end()
         if adapter is not None:
             adapter.close()
         self._lost = None
@@ -126,16 +135,19 @@ class CanLine:
             with self._sending:
                 adapter.send(cob_id, data)
         except adapter.failures as error:
-            raise self._failed(adapter, error) from error
+            raise self.fail(adapter, error) from error
         self.counters.sent += 1
         self._load.add(self.clock.now_ns(), len(data))
 
     def listen(self, cob_id: int, call: Listener) -> Listening:
         """Call with every data frame of that identifier, in the thread that receives it."""
+        self._begin_listening(cob_id, call)
+        return Listening(lambda: self._listeners.remove(cob_id, call))
+
+    def _begin_listening(self, cob_id: int, call: Listener) -> None:
         is_new, adapter = self._listeners.add(cob_id, call), self._adapter
         if is_new and adapter is not None:
             adapter.accept(self._listeners.cob_ids)
-        return Listening(lambda: self._listeners.remove(cob_id, call))
 
     def exchange(
         self, cob_id: int, data: bytes, reply_id: int, accept: Callable[[bytes], bool], timeout_s: float
@@ -145,26 +157,19 @@ class CanLine:
         Raises:
             LinkTimeout: none came. LinkLost: the adapter is gone, or off the bus.
         """
-        found: list[Received] = []
-        flag = self.clock.event()
-
-        def take(received: Received) -> None:
-            if not found and accept(received.data):
-                found.append(received)
-                flag.set()
-
-        listening = self.listen(reply_id, take)
+        awaited = Awaited(accept, self.clock.event())
+        self._begin_listening(reply_id, awaited.hear)
         try:
-            with nullcontext() if self.clock.in_transaction else self.clock.transaction():
-                self.send(cob_id, data)
-                self.wait(flag, timeout_s)
+            self.send(cob_id, data)
+            self.wait(awaited.flag, timeout_s)
         finally:
-            listening.cancel()
-        if not found:
+            self._listeners.remove(reply_id, awaited.hear)
+        found = awaited.found
+        if found is None:
             self.counters.timeouts += 1
             raise self.silence(f"no reply to {cob_id:03X}#{data.hex().upper()}", timeout_s)
         self.counters.exchanges += 1
-        return found[0]
+        return found
 
     def silence(self, what: str, timeout_s: float) -> LinkTimeout:
         """The error for something that has not come; it says so if the bit rate is to be suspected."""
@@ -184,14 +189,13 @@ class CanLine:
         Raises:
             LinkLost: the adapter is gone, or off the bus.
         """
-        self._waiting.add(flag)
-        try:
-            if self.clock.simulated or threading.get_ident() == self._receiving_thread:
-                self._receive_meanwhile(flag, self.clock.now_ns() + seconds_to_ns(timeout_s))
-            elif self._lost is None:
-                flag.wait(timeout_s)
-        finally:
-            self._waiting.discard(flag)
+        receiver = self._receiver
+        if receiver is not None:
+            self._waiting.add(flag)
+            try:
+                receiver.wait(flag, timeout_s)
+            finally:
+                self._waiting.discard(flag)
         self._require_adapter()
         return flag.is_set()
 
@@ -203,14 +207,8 @@ class CanLine:
         """
         if lock.acquire(blocking=False):
             return
-        deadline_ns = self.clock.now_ns() + seconds_to_ns(timeout_s)
-        taken = False
-        if threading.get_ident() == self._receiving_thread:
-            while not (taken := lock.acquire(blocking=False)) and self.clock.now_ns() < deadline_ns:
-                self._receive(min(deadline_ns, self.clock.now_ns() + _LOCK_STEP_NS))
-        elif not self.clock.simulated:  # where there is one thread only, whoever holds it cannot go on meanwhile
-            taken = lock.acquire(timeout=timeout_s)
-        if not taken:
+        receiver = self._receiver
+        if receiver is None or not receiver.acquire(lock, timeout_s):
             raise BusyError(f"{what} is under way", remedy="wait until it has ended, or stop the device")
 
     @contextmanager
@@ -241,13 +239,17 @@ class CanLine:
         return self._load.share(self.clock.now_ns())
 
     @property
+    def facts(self) -> BusFacts:
+        """The bus at present, for whoever examines a rig."""
+        connection = self.connection
+        return BusFacts(
+            name=f"CAN {connection.channel}", bitrate=connection.bitrate, load=self.load, counters=vars(self.counters)
+        )
+
+    @property
     def stamps_frames(self) -> bool:
         """Whether frames are stamped as they pass, and not when they are handed over."""
         return self._adapter is not None and self._adapter.stamps_frames
-
-    def shortest_ns(self, length: int) -> int:
-        """The shortest time that a data frame of so many bytes can take on the bus."""
-        return (_SHORTEST_FRAME_BITS + 8 * length) * NS_PER_S // self.connection.bitrate
 
     def service(self, kind: Callable[[CanLine], ServiceT]) -> ServiceT:
         """The one object of that kind which all users of the line share, made for the first who asks."""
@@ -257,58 +259,35 @@ class CanLine:
             found: ServiceT = self._services[kind]
             return found
 
-    # ------------------------------------------------------------------ receiving
+    # ------------------------------------------------------------------ for the receiver
 
-    def _receive_until_closed(self, adapter: CanAdapter) -> None:
-        self._receiving_thread = threading.get_ident()
-        while self._adapter is adapter and self._lost is None:
-            self._receive(self.clock.now_ns() + seconds_to_ns(_RECEIVE_S))
+    @property
+    def lost(self) -> bool:
+        """Whether the adapter is gone."""
+        return self._lost is not None
 
-    def _receive_meanwhile(self, flag: ClockEvent, deadline_ns: int) -> None:
-        if self.clock.simulated and not self.clock.in_transaction:
-            with self.clock.transaction():
-                self._receive_meanwhile(flag, deadline_ns)
-            return
-        while not flag.is_set() and self._lost is None:
-            now_ns = self.clock.now_ns()
-            if now_ns >= deadline_ns:
-                break
-            self._receive(min(deadline_ns, self._upkeep.do(now_ns)))
-
-    def _drain(self) -> None:
-        while self._receive(0):
-            pass
-
-    def _receive(self, until_ns: int) -> bool:
-        """Take the next frame that comes by then; tells whether one came."""
-        adapter = self._adapter
-        if adapter is None or self._lost is not None:
-            return False
-        try:
-            message = adapter.receive(max(0, until_ns - self.clock.now_ns()) / NS_PER_S)
-        except adapter.failures as error:
-            if self._adapter is adapter:
-                self._failed(adapter, error)
-            return False
-        if message is None:
-            return False
-        self._take(adapter, message)
-        return True
-
-    def _take(self, adapter: CanAdapter, message: can.Message) -> None:
+    def hear(self, cob_id: int, data: bytes, t_ns: int, dt_ns: int) -> None:
+        """A data frame with 11 bits of identifier has arrived at `t_ns` ± `dt_ns`."""
         self.counters.received += 1
-        data = bytes(message.data)
-        self._load.add(self.clock.now_ns(), len(data))
-        calls = self._listeners.of(message.arbitration_id)
-        if not calls or message.is_extended_id or message.is_remote_frame:
+        self._load.add(t_ns, len(data))
+        calls = self._listeners.by_id.get(cob_id)
+        if not calls:
             return
-        received = Received(message.arbitration_id, data, *adapter.stamp(message))
-        self.newest_ns = max(self.newest_ns, received.t_ns)
-        self._listeners.call(calls, received)
+        if t_ns > self.newest_ns:
+            self.newest_ns = t_ns
+        received = Received(cob_id, data, t_ns, dt_ns)
+        for call in calls:
+            try:
+                call(received)
+            except Exception as error:  # noqa: BLE001 - it must not make the line deaf, nor keep it from others
+                self._listeners.report(error)
 
-    # ------------------------------------------------------------------ failing
+    def pass_by(self, length: int) -> None:
+        """Another frame, of so many bytes, has arrived."""
+        self.counters.received += 1
+        self._load.add(self.clock.now_ns(), length)
 
-    def _failed(self, adapter: CanAdapter, cause: Exception) -> LinkError:
+    def fail(self, adapter: CanAdapter, cause: Exception) -> LinkError:
         """Note a failure; returns the error for whoever caused or awaits something."""
         error = adapter.explain(cause)
         if not isinstance(error, LinkLost):
@@ -335,8 +314,10 @@ class CanLine:
 _lines: weakref.WeakValueDictionary[tuple[int, str, str], CanLine] = weakref.WeakValueDictionary()
 
 
-def shared_can_line(connection: CanConnection, *, clock: Clock) -> CanLine:
+def shared_can_line(connection: CanConnection, *, clock: Clock, bus: Bus | None = None) -> CanLine:
     """The line of that interface and channel on that clock, closed until somebody opens it.
+
+    Its frames can be listened to on the first `bus` that is given: see `CanTap`.
 
     Raises:
         ConfigError: another device of the rig wants another bit rate, or other options, of the same bus.
@@ -345,6 +326,8 @@ def shared_can_line(connection: CanConnection, *, clock: Clock) -> CanLine:
     line = _lines.get(key)
     if line is None:
         line = _lines[key] = CanLine(connection, clock=clock)
+    if line.tap is None and bus is not None:
+        line.tap = CanTap(connection.channel, bus)
     for setting in ("bitrate", "options"):
         wanted, present = getattr(connection, setting), getattr(line.connection, setting)
         if wanted != present:

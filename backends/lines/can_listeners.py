@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import NamedTuple
 
-from microdrivers.core.clock import Clock
+from microdrivers.core.clock import Clock, ClockEvent
 from microdrivers.core.errors import LinkLost
 
 SILENCE_REMEDY = (
@@ -42,6 +42,23 @@ class Listening:
         end()
 
 
+class Awaited:
+    """The first frame that is accepted, as an answer. `found` is it, once `flag` is up."""
+
+    __slots__ = ("_accept", "flag", "found")
+
+    def __init__(self, accept: Callable[[bytes], bool], flag: ClockEvent) -> None:
+        self._accept = accept
+        self.flag = flag
+        self.found: Received | None = None
+
+    def hear(self, received: Received) -> None:
+        """A frame with the identifier of the answer."""
+        if self.found is None and self._accept(received.data):
+            self.found = received
+            self.flag.set()
+
+
 class CanCounters:
     """What has happened on a line since it was opened."""
 
@@ -61,30 +78,26 @@ class CanCounters:
 
 
 class Listeners:
-    """Tables that may be changed from any thread while another one goes through them."""
+    """Tables that may be changed from any thread while another one goes through them.
+
+    Attributes:
+        by_id: whom to call with a frame.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._by_id: dict[int, tuple[Listener, ...]] = {}
+        self.by_id: dict[int, tuple[Listener, ...]] = {}
         self._on_loss: tuple[LossListener, ...] = ()
 
     @property
     def cob_ids(self) -> Iterable[int]:
         """All that anybody has ever listened for."""
-        return tuple(self._by_id)
+        return tuple(self.by_id)
 
-    def of(self, cob_id: int) -> tuple[Listener, ...]:
-        """Whom to call with a frame."""
-        return self._by_id.get(cob_id, ())
-
-    def call(self, calls: Iterable[Listener], received: Received) -> None:
-        """Give a frame to these. An error of one reaches the main program, and neither the others nor the line."""
-        for call in calls:
-            try:
-                call(received)
-            except Exception as error:  # noqa: BLE001 - it must not make the line deaf: the clock hands it on
-                self._clock.call_at(self._clock.now_ns(), partial(_fail, error), name="CAN listener")
+    def report(self, error: Exception) -> None:
+        """Have the clock hand an error of a listener on to the main program."""
+        self._clock.call_at(self._clock.now_ns(), partial(_fail, error), name="CAN listener")
 
     @property
     def on_loss(self) -> tuple[LossListener, ...]:
@@ -94,14 +107,14 @@ class Listeners:
     def add(self, cob_id: int, call: Listener) -> bool:
         """Call with frames of that identifier from now on; tells whether nobody has listened for it before."""
         with self._lock:
-            is_new = cob_id not in self._by_id
-            self._by_id[cob_id] = (*self.of(cob_id), call)
+            is_new = cob_id not in self.by_id
+            self.by_id[cob_id] = (*self.by_id.get(cob_id, ()), call)
             return is_new
 
     def remove(self, cob_id: int, call: Listener) -> None:
         """Do not call any more. The identifier stays known."""
         with self._lock:
-            self._by_id[cob_id] = tuple(each for each in self.of(cob_id) if each is not call)
+            self.by_id[cob_id] = tuple([each for each in self.by_id.get(cob_id, ()) if each != call])
 
     def add_loss(self, call: LossListener) -> None:
         """Call when the adapter is lost."""

@@ -19,6 +19,10 @@ MARGIN_PX = 3
 """Pixels around the window that interpolation needs."""
 
 _TAPS = 6
+_NODES = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
+_LAGRANGE = np.linalg.inv(np.vander(_NODES, increasing=True)).T
+"""Coefficients, by rising power, of the polynomial that is 1 at one node and 0 at all others; one tap a row."""
+
 _COARSE_ROWS = 240
 _MAX_REDUCTION = 8
 _MAX_ITERATIONS = 30
@@ -103,7 +107,7 @@ class Template:
         start = shift
         for _ in range(_MAX_ITERATIONS):
             sampled = self._sample(image, shift)
-            fitted = _product(self._projection, sampled)
+            fitted = product(self._projection, sampled)
             if not fitted[2] > 0.0:
                 return None
             step = fitted[:2] / fitted[2]
@@ -116,14 +120,8 @@ class Template:
 
     def _sample(self, image: Float32Array, shift: FloatArray) -> FloatArray:
         """The image in the shifted window, interpolated, minus the template's mean level."""
-        corner = self._centre - self._half + shift
-        whole = np.floor(corner).astype(int)
-        part_u, part_v = (corner - whole).tolist()
-        u, v = (whole - _TAPS // 2 + 1).tolist()
-        width, height = self._size
-        surrounded = image[v : v + height + _TAPS - 1, u : u + width + _TAPS - 1]
-        filtered = cv2.sepFilter2D(surrounded, -1, _interpolator(part_u), _interpolator(part_v), anchor=(0, 0))
-        return filtered[:height, :width].astype(np.float64).ravel() - self._level
+        window = interpolated(image, self._centre - self._half + shift, self._size)
+        return window.astype(np.float64).ravel() - self._level
 
     def _judge(self, sampled: FloatArray, fitted: FloatArray, shift: FloatArray) -> Match:
         residuals = sampled - np.einsum("i,ij->j", fitted, self._rows)
@@ -132,7 +130,7 @@ class Template:
         correlation = math.sqrt(max(0.0, 1.0 - squares / total)) if total > 0.0 else 0.0
         gain = float(fitted[2])
         variance = max(squares / (len(residuals) - 4), _ROUNDING_VARIANCE) / gain**2
-        affine = _product(self._deformation, sampled) / gain
+        affine = product(self._deformation, sampled) / gain
         return Match(
             shift=shift,
             sigma_px=math.sqrt(0.5 * variance * float(np.trace(self._inverse_normal[:2, :2]))),
@@ -142,22 +140,32 @@ class Template:
         )
 
 
-def _product(rows: FloatArray, vector: FloatArray) -> FloatArray:
+def product(rows: FloatArray, vector: FloatArray) -> FloatArray:
     """`rows` @ `vector` without BLAS, whose threads get in the way of OpenCV's and cost ten times the product."""
     return np.asarray(np.einsum("ij,j->i", rows, vector))
 
 
-def _interpolator(part: float) -> FloatArray:
+def interpolated(image: Float32Array, corner: FloatArray, size: tuple[int, int]) -> Float32Array:
+    """The window of `size` (columns, rows) whose top-left pixel lies at `corner` (u, v), between the pixels.
+
+    `image` reaches `MARGIN_PX` beyond the window.
+    """
+    whole = np.floor(corner).astype(int)
+    part_u, part_v = (corner - whole).tolist()
+    u, v = (whole - _TAPS // 2 + 1).tolist()
+    width, height = size
+    surrounded = image[v : v + height + _TAPS - 1, u : u + width + _TAPS - 1]
+    filtered = cv2.sepFilter2D(surrounded, -1, interpolator(part_u), interpolator(part_v), anchor=(0, 0))
+    return np.asarray(filtered[:height, :width], dtype=np.float32)
+
+
+def interpolator(part: float) -> FloatArray:
     """Six-tap Lagrange interpolation at `part` (0 … 1) between the third and fourth tap.
 
     Exact for polynomials up to the fifth degree. Two taps (bilinear) pull fine texture towards whole pixels by
     up to 0.01 px.
     """
-    nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
-    differences = nodes[:, None] - nodes[None, :] + np.eye(_TAPS)
-    factors = (part - nodes[None, :]) / differences
-    np.fill_diagonal(factors, 1.0)
-    return np.asarray(factors.prod(axis=1))
+    return np.asarray(_LAGRANGE @ part ** np.arange(_TAPS))
 
 
 def _chip_half(half: tuple[int, int]) -> tuple[int, int]:

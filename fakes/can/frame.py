@@ -16,6 +16,9 @@ INTERFRAME_BITS = 3
 ERROR_FRAME_BITS = 20
 """Error flag (6), its longest echo by the others (6) and the delimiter (8)."""
 
+MOST_BITS = 64 + 8 * 8 + (53 + 8 * 8) // 4
+"""Of an extended frame with 8 bytes and as many stuff bits as there can be."""
+
 _MAX_DATA = 8
 _CRC_POLYNOMIAL = 0x4599
 _CRC_MASK = 0x7FFF
@@ -56,7 +59,16 @@ def arbitration_rank(frame: Frame) -> int:
     return _header(frame.id, frame.extended, frame.remote, len(frame.data)).rank
 
 
-@functools.lru_cache(maxsize=4096)
+@functools.lru_cache(maxsize=16384)
+def frame_shape(frame: Frame) -> tuple[int, int]:
+    """`arbitration_rank` and `frame_bits`.
+
+    Raises:
+        OutOfRange: it is no classic frame.
+    """
+    return arbitration_rank(frame), frame_bits(frame)
+
+
 def frame_bits(frame: Frame) -> int:
     """Bits from the start of frame to the end of frame, stuff bits included, without the interframe space.
 

@@ -9,12 +9,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from microdrivers.core.clock import Clock
+from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import seconds_to_ns
 from microdrivers.fakes.can.frame import Frame
 from microdrivers.fakes.can.pacing import Pacer, RealTimePacer, SimulatedPacer
-from microdrivers.fakes.can.port import PROTOCOL_ERROR, Arrival, Port, PortError
+from microdrivers.fakes.can.port import PROTOCOL_ERROR, Port, PortError
 from microdrivers.fakes.can.timeline import BusTimeline, CanNode
 
 LOG_LENGTH = 20_000
@@ -22,6 +22,9 @@ LOG_LENGTH = 20_000
 
 BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 """Bit rates of CiA 301, and 100 kbit/s."""
+
+
+_Passed = tuple[int, Literal["host", "node", "error"], Frame]
 
 
 class Temper(NamedTuple):
@@ -48,6 +51,7 @@ class Medium:
         log: what passed, as (end of the frame in ns, who sent it, frame); the newest `LOG_LENGTH`. An error frame is
             logged as `PROTOCOL_ERROR` by "error". Take `list(log)` while the medium is in use.
         error_frames: error frames so far.
+        on_passed: is told what `log` is told, while the medium is held; it must be short and not wait.
     """
 
     def __init__(self, name: str, *, clock: Clock, bitrate: int, seed: int, temper: Temper | None = None) -> None:
@@ -61,17 +65,20 @@ class Medium:
         self.bitrate = bitrate
         self.seed = seed
         self.lock = threading.RLock()
-        self.log: deque[tuple[int, Literal["host", "node", "error"], Frame]] = deque(maxlen=LOG_LENGTH)
+        self.log: deque[_Passed] = deque(maxlen=LOG_LENGTH)
         self.error_frames = 0
+        self.on_passed: Callable[[int, Literal["host", "node", "error"], Frame], object] | None = None
         self.plugged = True
         self._timeline = BusTimeline(bitrate=bitrate, on_passed=self._deliver)
         self._ports: list[Port] = []
-        self._busy: deque[tuple[int, int]] = deque(maxlen=LOG_LENGTH)
-        self._random = random.Random(seed)
+        self._draw = random.Random(seed).random
         self._max_delay_ns = seconds_to_ns((temper or Temper()).max_delay_s) if clock.simulated else 0
-        self._pacer: Pacer = SimulatedPacer(clock, self.turn)
-        if not clock.simulated:
-            self._pacer = RealTimePacer(clock, self.turn, lock=self.lock, name=name)
+        self._pacer: Pacer
+        if isinstance(clock, SimulatedClock):
+            self._pacer = SimulatedPacer(clock, self._timeline.play)
+        else:
+            with self.lock:  # its thread turns the medium at once
+                self._pacer = RealTimePacer(clock, self.turn, lock=self.lock, name=name)
 
     # ------------------------------------------------------------------ who is there
 
@@ -105,7 +112,7 @@ class Medium:
         with self.lock:
             if not self.plugged:
                 raise _unplugged(self.name)
-            port = Port(self, bitrate=bitrate or self.bitrate, receive_own=receive_own)
+            port = Port(self, self._timeline, self._pacer, bitrate=bitrate or self.bitrate, receive_own=receive_own)
             self._ports.append(port)
             return port
 
@@ -137,7 +144,7 @@ class Medium:
             self._timeline.play(self.clock.now_ns())
             sender = self._timeline.disturb(self.clock.now_ns())
             if isinstance(sender, Port):
-                sender.destroyed(again=False)
+                sender.destroyed(self.clock.now_ns(), again=False)
             self._plan()
 
     # ------------------------------------------------------------------ time
@@ -149,12 +156,6 @@ class Medium:
             self._pacer.plan(due_ns)
             return due_ns
 
-    def turn_until(self, reached: Callable[[], bool], deadline_ns: int) -> int:
-        """Let happen what is due until `reached()`, or by `deadline_ns`; returns when something has happened last."""
-        with self.lock:
-            self._pacer.plan(self._timeline.play(deadline_ns, reached=reached))
-            return self._timeline.last_event_ns
-
     def next_event_ns(self) -> int:
         """When something happens next on the bus; `NEVER_NS` if all is quiet."""
         with self.lock:
@@ -163,16 +164,18 @@ class Medium:
     def load(self, window_s: float = 1.0) -> float:
         """Share of the last `window_s` in which the bus was not free, 0 to 1; interframe spaces count as taken.
 
-        At most the newest `LOG_LENGTH` frames are looked at.
+        Only frames that are in the log are looked at.
         """
         with self.lock:
             end_ns = self.clock.now_ns()
             begin_ns = end_ns - seconds_to_ns(window_s)
             self.turn(end_ns)
             busy_ns = 0
-            for start_ns, free_ns in reversed(self._busy):
+            for passed_ns, who, frame in reversed(self.log):
+                free_ns = passed_ns + self._timeline.interframe_ns
                 if free_ns <= begin_ns:
                     break
+                start_ns = passed_ns - self._timeline.duration_ns(None if who == "error" else frame)
                 busy_ns += max(0, min(free_ns, end_ns) - max(start_ns, begin_ns))
             return busy_ns / (end_ns - begin_ns)
 
@@ -183,17 +186,6 @@ class Medium:
         self._pacer.close()
 
     # ------------------------------------------------------------------ for ports
-
-    def offer(self, port: Port, frame: Frame, t_ns: int) -> None:
-        """A port's oldest frame competes from `t_ns` on."""
-        self._timeline.offer(port, frame, t_ns, readable=port.readable)
-
-    def settle(self) -> None:
-        """A port has offered a frame."""
-        if self.clock.simulated:
-            self._plan()  # it starts when all who offer one at this instant have done so
-        else:
-            self.turn()
 
     def forget(self, port: Port) -> None:
         """A port leaves, and its frames with it."""
@@ -206,28 +198,31 @@ class Medium:
         self._pacer.plan(self._timeline.next_event_ns())
 
     def _deliver(self, sender: object, frame: Frame, start_ns: int, end_ns: int, intact: bool) -> None:
-        self._busy.append((start_ns, end_ns + self._timeline.interframe_ns))
-        if intact:
-            self.log.append((end_ns, "host" if isinstance(sender, Port) else "node", frame))
-        else:
-            self.log.append((end_ns, "error", PROTOCOL_ERROR))
-            self.error_frames += 1
+        who: Literal["host", "node", "error"] = "host" if isinstance(sender, Port) else "node"
+        passed: _Passed = (end_ns, who, frame) if intact else (end_ns, "error", PROTOCOL_ERROR)
+        self.log.append(passed)
+        if self.on_passed is not None:
+            self.on_passed(*passed)
         ready_ns = end_ns
         if self._max_delay_ns:
-            ready_ns += round(self._random.random() * self._max_delay_ns)
+            ready_ns += round(self._draw() * self._max_delay_ns)
+        if not intact:
+            self._deliver_error(sender, start_ns, end_ns, ready_ns)
+            return
         for port in self._ports:
-            if port is sender and intact:
-                if port.receive_own:
-                    port.take(Arrival(end_ns, frame, own=True), start_ns, ready_ns)
-            elif intact and port.readable:
-                port.take(Arrival(end_ns, frame), start_ns, ready_ns)
-            else:
-                port.take(Arrival(end_ns, PROTOCOL_ERROR, error=True), start_ns, ready_ns)
+            if port is not sender:
+                port.take(frame, start_ns, end_ns, ready_ns)
+            elif port.receive_own:
+                port.take(frame, start_ns, end_ns, ready_ns, own=True)
         if isinstance(sender, Port):
-            if intact:
-                sender.sent()
-            else:
-                sender.destroyed(again=True)
+            sender.sent()
+
+    def _deliver_error(self, sender: object, start_ns: int, end_ns: int, ready_ns: int) -> None:
+        self.error_frames += 1
+        for port in self._ports:
+            port.take(PROTOCOL_ERROR, start_ns, end_ns, ready_ns, error=True)
+        if isinstance(sender, Port):
+            sender.destroyed(end_ns, again=True)
 
 
 def _unplugged(name: str) -> PortError:

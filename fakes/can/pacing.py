@@ -2,54 +2,112 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from heapq import heappop, heappush
 from typing import Protocol
 
-from microdrivers.core.clock import Clock, Timer
+from microdrivers.core.clock import Clock, SimulatedClock, Timer
 from microdrivers.core.units import NS_PER_S
 from microdrivers.fakes.can.timeline import NEVER_NS
 
 _LONGEST_WAIT_S = 3600.0
 
 
+Call = Callable[[int], object]
+"""Is given the present, ns."""
+
+
 class Pacer(Protocol):
-    """Calls `turn` when it is time."""
+    """Turns the medium when it is time, and calls what was asked for."""
 
     def plan(self, due_ns: int) -> None:
-        """The next event is at `due_ns`; called after everything that may have changed that."""
+        """The bus' next event is at `due_ns`; called after everything that may have changed that."""
+
+    def call_at(self, t_ns: int, call: Call) -> None:
+        """Call at `t_ns`, or as soon as possible after it."""
 
     def close(self) -> None:
         """No call starts after this; idempotent."""
 
 
 class SimulatedPacer:
-    """One pending call on the simulated clock, at the next event or before it."""
+    """Works off what falls due on a simulated clock: events of the bus, and calls to those who wait for frames.
 
-    def __init__(self, clock: Clock, turn: Callable[[], int]) -> None:
+    One call of the clock does all that comes before anybody else's turn, a whole burst of frames for instance. The
+    clock then has one pending call; those behind it in `_pending` serve when the bus' next event moves away again.
+
+    Args:
+        play: lets happen on the bus what is due by a time, but no more after a frame's end at which its second
+            argument tells so; returns when the bus' next event is.
+    """
+
+    def __init__(self, clock: SimulatedClock, play: Callable[[int, Callable[[], object]], int]) -> None:
         self._clock = clock
-        self._turn = turn
-        self._due_ns = NEVER_NS
-        self._timer: Timer | None = None
+        self._play = play
+        self._bus_ns = NEVER_NS
+        self._calls: list[tuple[int, int, Call]] = []  # heap by time
+        self._numbers = itertools.count()
+        self._pending: list[tuple[int, Timer]] = []  # latest first
+        self._will_ask = False
+        self._closed = False
 
     def plan(self, due_ns: int) -> None:
         """See `Pacer.plan`."""
-        if due_ns >= self._due_ns:
-            return  # the pending call plans again
-        if self._timer is not None:
-            self._timer.cancel()
-        self._due_ns = due_ns
-        self._timer = self._clock.call_at(due_ns, self._fire, name="CAN medium")
+        self._bus_ns = due_ns
+        if not self._will_ask:
+            self._ask()
+
+    def call_at(self, t_ns: int, call: Call) -> None:
+        """See `Pacer.call_at`; calls at equal times keep their order."""
+        heappush(self._calls, (t_ns, next(self._numbers), call))
+        if not self._will_ask:
+            self._ask()
 
     def close(self) -> None:
         """See `Pacer.close`."""
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer, self._due_ns = None, NEVER_NS
+        self._closed = True
+        while self._pending:
+            self._pending.pop()[1].cancel()
 
-    def _fire(self) -> None:
-        self._timer, self._due_ns = None, NEVER_NS
-        self._turn()
+    def _ask(self) -> None:
+        """Have the clock call when something is due; in an exchange, where that changes often, when it has ended."""
+        if self._clock.in_transaction:
+            self._will_ask = True
+            self._clock.after_exchange(self._ask_clock)
+        else:
+            self._ask_clock()
+
+    def _ask_clock(self) -> None:
+        self._will_ask = False
+        due_ns, pending = self._bus_ns, self._pending
+        if self._calls and self._calls[0][0] < due_ns:
+            due_ns = self._calls[0][0]
+        while pending and pending[-1][0] < due_ns:
+            pending.pop()[1].cancel()
+        if due_ns < NEVER_NS and not self._closed and (not pending or pending[-1][0] > due_ns):
+            pending.append((due_ns, self._clock.call_at(due_ns, self._run, name="CAN medium")))
+
+    def _run(self) -> None:
+        clock, calls = self._clock, self._calls
+        self._pending.pop()
+        self._will_ask = True
+        try:
+            while not self._closed:
+                now_ns = clock.now_ns()
+                while calls and calls[0][0] <= now_ns:
+                    heappop(calls)[2](now_ns)
+                last_ns = clock.free_until_ns() - 1
+                if calls and calls[0][0] < last_ns:
+                    last_ns = calls[0][0]
+                self._bus_ns = due_ns = self._play(last_ns if last_ns > now_ns else now_ns, calls.__len__)
+                if calls and calls[0][0] < due_ns:
+                    due_ns = calls[0][0]
+                if due_ns == NEVER_NS or not clock.go_on_at(due_ns):
+                    return
+        finally:
+            self._ask_clock()
 
 
 class RealTimePacer:
@@ -72,6 +130,10 @@ class RealTimePacer:
         """See `Pacer.plan`."""
         if due_ns < self._due_ns:
             self._changed.set()
+
+    def call_at(self, t_ns: int, call: Call) -> None:
+        """See `Pacer.call_at`: what has happened is told at once."""
+        call(t_ns)
 
     def close(self) -> None:
         """See `Pacer.close`."""

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from microdrivers.core.clock import ClockError
 from microdrivers.core.errors import LinkError
 from microdrivers.core.units import NS_PER_S, seconds_to_ns
-from microdrivers.fakes.can.frame import Frame, arbitration_rank
-from microdrivers.fakes.can.timeline import NEVER_NS
+from microdrivers.fakes.can.frame import Frame, frame_shape
+from microdrivers.fakes.can.pacing import Pacer
+from microdrivers.fakes.can.timeline import NEVER_NS, BusTimeline
 
 if TYPE_CHECKING:
     from microdrivers.fakes.can.medium import Medium
@@ -25,6 +26,9 @@ RECEIVE_QUEUE = 8192
 _LONGEST_WAIT_NS = 3600 * NS_PER_S
 _ERROR_LIMIT = 256
 _ERRORS_AN_ATTEMPT = 8
+
+EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 1 << 31, 1 << 30, 1 << 29
+"""In an identifier, as in linux/can.h."""
 
 PROTOCOL_ERROR = Frame(0x008, bytes(8))
 """An error frame, as SocketCAN shows it: the class of the error as identifier (linux/can/error.h)."""
@@ -53,6 +57,10 @@ class Arrival(NamedTuple):
     own: bool = False
 
 
+# From when on the host can read it, and the fields of an `Arrival`. A plain tuple: one is made for each frame.
+_Received = tuple[int, int, Frame, bool, bool]
+
+
 class Port:
     """Sends in the order of its calls, as SocketCAN does, and receives what the others send.
 
@@ -67,8 +75,10 @@ class Port:
         transmit_errors: error counter: 8 up for each destroyed frame, 1 down for each other; bus-off at 256.
     """
 
-    def __init__(self, medium: Medium, *, bitrate: int, receive_own: bool) -> None:
+    def __init__(self, medium: Medium, timeline: BusTimeline, pacer: Pacer, *, bitrate: int, receive_own: bool) -> None:
         self.medium = medium
+        self._timeline = timeline
+        self._pacer = pacer
         self.readable = bitrate == medium.bitrate
         self.receive_own = receive_own
         self.dropped_frames = 0
@@ -78,13 +88,17 @@ class Port:
         self._lock = medium.lock
         self._failure: PortError | None = None
         self._to_send: deque[tuple[int, Frame]] = deque()
-        self._received: deque[tuple[int, Arrival]] = deque()
+        self._received: deque[_Received] = deque()
         self._filters: tuple[tuple[int, int, bool | None], ...] = ()
-        self._accepted: dict[tuple[int, bool], bool] = {}
+        self._accepted: dict[int, bool] = {}
         self._arrived = medium.clock.event()
         self._waiting = False
         self._exchanging = False
         self._call: Callable[[], None] | None = None
+        self._take: Callable[[int, bytes, int], object] | None = None
+        self._lost: Callable[[PortError], object] = lambda _: None
+        self._tell: Callable[[int], None] | None = None
+        self._choose_call()
 
     # ------------------------------------------------------------------ host side
 
@@ -95,18 +109,26 @@ class Port:
             OutOfRange: it is no classic frame.
             PortError: the queue is full, or the port is closed, unplugged or bus-off.
         """
-        arbitration_rank(frame)  # raises
         with self._lock:
-            self._check()
-            at_ns = max(t_ns, self._clock.now_ns())
-            if len(self._to_send) >= TRANSMIT_QUEUE:
+            if self._failure is not None:
+                self._check()
+            now_ns, queue = self._clock.now_ns(), self._to_send
+            at_ns = t_ns if t_ns > now_ns else now_ns
+            if queue:
+                frame_shape(frame)  # raises
+                if len(queue) >= TRANSMIT_QUEUE:
+                    self.medium.turn()
+                if len(queue) >= TRANSMIT_QUEUE:
+                    raise PortError("the transmit queue is full", number=errno.ENOBUFS, remedy="send less at once")
+            if queue:
+                queue.append((at_ns, frame))
+                return
+            self._timeline.offer(self, frame, at_ns, self.readable)
+            queue.append((at_ns, frame))
+            if self._clock.simulated:
+                self._pacer.plan(self._timeline.next_event_ns())  # it starts when all who offer one now have done so
+            else:
                 self.medium.turn()
-            if len(self._to_send) >= TRANSMIT_QUEUE:
-                raise PortError("the transmit queue is full", number=errno.ENOBUFS, remedy="send less at once")
-            self._to_send.append((at_ns, frame))
-            if len(self._to_send) == 1:
-                self.medium.offer(self, frame, at_ns)
-                self.medium.settle()
 
     def receive(self, timeout_s: float | None) -> Arrival | None:
         """The oldest frame that has arrived; waits up to `timeout_s` for one.
@@ -122,7 +144,8 @@ class Port:
             raise ClockError("an emulated CAN port needs a time-out on a simulated clock")
         deadline_ns = NEVER_NS if timeout_s is None else clock.now_ns() + seconds_to_ns(timeout_s)
         if clock.in_transaction:
-            return self._receive_in_exchange(deadline_ns)
+            received = self._await_in_exchange(deadline_ns)
+            return None if received is None else _arrival(received)
         while True:
             now_ns = clock.now_ns()
             arrival = self.poll(now_ns)
@@ -132,10 +155,12 @@ class Port:
                 clock.sleep_until(min(self._received[0][0], deadline_ns))
                 continue
             self._waiting = True
+            self._choose_call()
             try:
                 self._arrived.wait(min(deadline_ns - now_ns, _LONGEST_WAIT_NS) / NS_PER_S)
             finally:
                 self._waiting = False
+                self._choose_call()
 
     def poll(self, t_ns: int) -> Arrival | None:
         """The oldest frame that has arrived by `t_ns`, without waiting.
@@ -150,7 +175,7 @@ class Port:
                 self.medium.turn(t_ns)
                 self._check()
             if received and received[0][0] <= t_ns:
-                return received.popleft()[1]
+                return _arrival(received.popleft())
             if not received:
                 self._arrived.clear()
             return None
@@ -172,7 +197,31 @@ class Port:
         A simulated clock calls, at the arrival's time. In real time the thread that turns the medium calls, while it
         holds the medium: the call must be short and not wait.
         """
-        self._call = call
+        self._call, self._take = call, None
+        self._choose_call()
+
+    def deliver_to(self, take: Callable[[int, bytes, int], object], lost: Callable[[PortError], object]) -> None:
+        """On a simulated clock, have `take` called with everything that arrives, and `lost` when the port fails.
+
+        `take` is given identifier, data and the end of the frame. The identifier has SocketCAN's flags, such as
+        `EXTENDED_FLAG`. In an exchange, where the clock calls nobody, `receive_until` does so.
+        """
+        self._take, self._lost = take, lost
+        self._choose_call()
+        if self._received:
+            self._pacer.call_at(max(self._received[0][0], self._clock.now_ns()), self._hand_over)
+
+    def receive_until(self, enough: Callable[[], bool], deadline_ns: int) -> None:
+        """In an exchange, hand over what arrives to whom `deliver_to` has named, until `enough()` or the deadline.
+
+        Raises:
+            PortError: the port is closed, unplugged or bus-off.
+        """
+        while not enough():
+            received = self._await_in_exchange(deadline_ns)
+            if received is None:
+                return
+            self._give(received)
 
     def set_filters(self, filters: Sequence[tuple[int, int, bool | None]]) -> None:
         """Receive only frames whose identifier is `id` where `mask` has ones, as (id, mask, extended or either).
@@ -185,7 +234,8 @@ class Port:
 
     def close(self) -> None:
         """Leave the bus; idempotent."""
-        self._call = None
+        self._call = self._take = None
+        self._choose_call()
         self.fail(PortError("the CAN port is closed", number=errno.EBADF, remedy="open it again"))
 
     # ------------------------------------------------------------------ bus side
@@ -196,34 +246,38 @@ class Port:
         self._to_send.popleft()
         self._compete()
 
-    def destroyed(self, *, again: bool) -> None:
+    def destroyed(self, t_ns: int, *, again: bool) -> None:
         """The port's oldest frame was destroyed; it competes again, if the bus does not see to that."""
         self.transmit_errors += _ERRORS_AN_ATTEMPT
         if self.transmit_errors >= _ERROR_LIMIT:
-            self.bus_off()
+            self.bus_off(t_ns)
         elif again:
             self._compete()
 
-    def take(self, arrival: Arrival, start_ns: int, ready_ns: int) -> None:
-        """A frame has arrived that began at `start_ns`; the host can read it from `ready_ns` on."""
-        if self._failure is not None or start_ns < self._opened_ns or not (arrival.error or self._accepts(arrival)):
+    def take(
+        self, frame: Frame, start_ns: int, end_ns: int, ready_ns: int, error: bool = False, own: bool = False
+    ) -> None:
+        """A frame has arrived, from `start_ns` to `end_ns`; the host can read it from `ready_ns` on."""
+        if not self.readable and not error:
+            frame, error, own = PROTOCOL_ERROR, True, False
+        if self._failure is not None or start_ns < self._opened_ns:
+            return
+        if self._filters and not (error or own or self._accepts(frame)):
             return
         if len(self._received) >= RECEIVE_QUEUE:
             self.dropped_frames += 1
             return
-        self._received.append((ready_ns, arrival))
-        if not self._clock.simulated:
-            self._notify()
-        elif (self._waiting or self._call is not None) and not self._exchanging:
-            self._clock.call_at(ready_ns, self._notify, name="CAN arrival")
+        self._received.append((ready_ns, end_ns, frame, error, own))
+        if self._tell is not None and not self._exchanging:
+            self._pacer.call_at(ready_ns, self._tell)
 
-    def bus_off(self) -> None:
-        """The controller has taken itself off the bus."""
+    def bus_off(self, t_ns: int = 0) -> None:
+        """The controller has taken itself off the bus, now or at `t_ns`."""
         remedy = "check the bit rate, the termination and the wiring, then open the bus again"
-        self.fail(PortError("the CAN controller is bus-off", number=errno.ENETDOWN, remedy=remedy))
+        self.fail(PortError("the CAN controller is bus-off", number=errno.ENETDOWN, remedy=remedy), t_ns)
 
-    def fail(self, failure: PortError) -> None:
-        """The port is of no use from now on; the first reason stays."""
+    def fail(self, failure: PortError, t_ns: int = 0) -> None:
+        """The port is of no use from now on, or from `t_ns` on; the first reason stays."""
         with self._lock:
             if self._failure is not None:
                 return
@@ -231,21 +285,15 @@ class Port:
             self._to_send.clear()
             self._received.clear()
             self.medium.forget(self)
-            if self._clock.simulated:
-                self._clock.call_at(self._clock.now_ns(), self._notify, name="CAN port lost")
-            else:
-                self._notify()
+            self._pacer.call_at(max(t_ns, self._clock.now_ns()), self._tell or self._notify)
 
     def _compete(self) -> None:
         if self._to_send:
             at_ns, frame = self._to_send[0]
-            self.medium.offer(self, frame, at_ns)
+            self._timeline.offer(self, frame, at_ns, self.readable)
 
-    def _accepts(self, arrival: Arrival) -> bool:
-        frame = arrival.frame
-        if not self._filters or arrival.own:
-            return True
-        key = (frame.id, frame.extended)
+    def _accepts(self, frame: Frame) -> bool:
+        key = frame.id | EXTENDED_FLAG if frame.extended else frame.id
         accepted = self._accepted.get(key)
         if accepted is None:
             accepted = self._accepted[key] = any(
@@ -254,37 +302,66 @@ class Port:
             )
         return accepted
 
-    def _notify(self) -> None:
-        if self._failure is None and self._clock.simulated and not self._readable_now():
+    def _choose_call(self) -> None:
+        """What the pacer calls when something can be read: nothing if nobody wants to know."""
+        if self._take is not None:
+            self._tell = self._hand_over
+        else:
+            wanted = self._call is not None or self._waiting or not self._clock.simulated
+            self._tell = self._notify if wanted else None
+
+    def _notify(self, now_ns: int) -> None:
+        """Something can be read, or the port has failed: tell whoever waits."""
+        if self._failure is None and not (self._received and self._received[0][0] <= now_ns):
             return  # it was read meanwhile
         self._arrived.set()
         if self._call is not None:
             self._call()
 
-    def _readable_now(self) -> bool:
-        return bool(self._received) and self._received[0][0] <= self._clock.now_ns()
+    def _hand_over(self, now_ns: int) -> None:
+        """The same for the one to whom everything is delivered."""
+        while self._received and self._received[0][0] <= now_ns:
+            self._give(self._received.popleft())
+        if self._failure is not None:
+            self._lost(self._failure)
+
+    def _give(self, received: _Received) -> None:
+        _, t_ns, (identifier, data, extended, remote), error, _ = received
+        if extended or remote or error:
+            identifier |= extended * EXTENDED_FLAG | remote * REMOTE_FLAG | error * ERROR_FLAG
+        if self._take is not None:
+            self._take(identifier, data, t_ns)
 
     def _check(self) -> None:
         failure = self._failure
         if failure is not None:
             raise PortError(failure.what, number=failure.number, remedy=failure.remedy)
 
-    def _receive_in_exchange(self, deadline_ns: int) -> Arrival | None:
+    def _await_in_exchange(self, deadline_ns: int) -> _Received | None:
         """Nobody else acts meanwhile: the bus is played until something has arrived."""
-        clock = self._clock
-        self._exchanging = True
-        try:
-            last_ns = self.medium.turn_until(self._has_news, deadline_ns)
-        finally:
-            self._exchanging = False
-        if self._received:
-            ready_ns = self._received[0][0]
-            clock.sleep_until(min(ready_ns, deadline_ns))
-            if ready_ns > deadline_ns:
-                clock.call_at(ready_ns, self._notify, name="CAN arrival")
-        else:
-            clock.sleep_until(deadline_ns if self._failure is None else last_ns)
-        return self.poll(clock.now_ns())
+        clock, received = self._clock, self._received
+        if self._failure is not None:
+            self._check()
+        if not received:
+            self._exchanging = True
+            try:
+                self._pacer.plan(self._timeline.play(deadline_ns, self._has_news))
+            finally:
+                self._exchanging = False
+            if self._failure is not None:
+                clock.sleep_until(self._timeline.last_event_ns)
+                self._check()
+        if not received or received[0][0] > deadline_ns:
+            clock.sleep_until(deadline_ns)
+            if received and self._tell is not None:
+                self._pacer.call_at(received[0][0], self._tell)
+            return None
+        clock.sleep_until(received[0][0])
+        return received.popleft()
 
     def _has_news(self) -> bool:
         return bool(self._received) or self._failure is not None
+
+
+def _arrival(received: _Received) -> Arrival:
+    return Arrival(*received[1:])

@@ -17,6 +17,9 @@ from microdrivers.fakes.can.registry import medium_named
 class MediumBus(can.BusABC):
     """A port of an emulated bus. All waiting, and all time stamps, are on the medium's clock.
 
+    Beyond python-can's interface there are `on_arrival`, and for a host in the same process and on a simulated clock
+    `send_data`, `deliver_to` and `receive_until`: the same port, without messages and threads.
+
     Classic frames only. Further settings, which belong to real adapters, are accepted and have no effect.
 
     Args:
@@ -63,10 +66,15 @@ class MediumBus(can.BusABC):
         data = bytes(msg.dlc) if msg.is_remote_frame else bytes(msg.data)
         try:
             self._port.send(Frame(msg.arbitration_id, data, msg.is_extended_id, msg.is_remote_frame))
-        except PortError as error:
-            raise can.CanOperationError(error.what, error.number) from error
-        except OutOfRange as error:
-            raise can.CanOperationError(error.what, errno.EINVAL) from error
+        except (PortError, OutOfRange) as error:
+            raise _operation_error(error) from error
+
+    def send_data(self, identifier: int, data: bytes) -> None:
+        """Put a data frame with an identifier of 11 bits into the transmit queue; errors as `send`."""
+        try:
+            self._port.send(Frame(identifier, data))
+        except (PortError, OutOfRange) as error:
+            raise _operation_error(error) from error
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The oldest message that has arrived; waits up to `timeout` seconds on the medium's clock.
@@ -81,7 +89,7 @@ class MediumBus(can.BusABC):
         try:
             arrival = self._port.receive(timeout)
         except PortError as error:
-            raise can.CanOperationError(error.what, error.number) from error
+            raise _operation_error(error) from error
         return None if arrival is None else self._message(arrival)
 
     def on_arrival(self, call: Callable[[], None] | None) -> None:
@@ -90,6 +98,27 @@ class MediumBus(can.BusABC):
         A simulated clock calls, at that time. In real time the thread that turns the medium calls: it must not wait.
         """
         self._port.on_arrival(call)
+
+    def deliver_to(
+        self, take: Callable[[int, bytes, int], object], lost: Callable[[can.CanOperationError], object]
+    ) -> None:
+        """On a simulated clock, have it call `take` with everything that arrives, and `lost` when the bus has failed.
+
+        `take` is given the identifier, with SocketCAN's flags for extended, remote and error frames, the data, and when
+        the frame ended, ns. In an exchange, where the clock calls nobody, `receive_until` does so.
+        """
+        self._port.deliver_to(take, lambda error: lost(_operation_error(error)))
+
+    def receive_until(self, enough: Callable[[], bool], deadline_ns: int) -> None:
+        """In an exchange, let time pass and hand over what arrives until `enough()`, or until the deadline.
+
+        Raises:
+            can.CanOperationError: see `recv`.
+        """
+        try:
+            self._port.receive_until(enough, deadline_ns)
+        except PortError as error:
+            raise _operation_error(error) from error
 
     def shutdown(self) -> None:
         """Leave the bus; idempotent."""
@@ -124,3 +153,7 @@ class MediumBus(can.BusABC):
             data=frame.data,
             is_rx=not arrival.own,
         )
+
+
+def _operation_error(error: PortError | OutOfRange) -> can.CanOperationError:
+    return can.CanOperationError(error.what, error.number if isinstance(error, PortError) else errno.EINVAL)

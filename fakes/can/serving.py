@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 from microdrivers.core.errors import RefusedError, UnsupportedError
 from microdrivers.devices.drivers import Endpoint, ServeRequest
+from microdrivers.devices.wire_tap import CanTap
+from microdrivers.fakes.can.frame import Frame
 from microdrivers.fakes.can.medium import Medium
 from microdrivers.fakes.can.slcan import SlcanAdapter
 from microdrivers.fakes.wire import Cable, Temper, Wire
@@ -88,6 +90,8 @@ def serve_medium(name: str, medium: Medium, request: ServeRequest) -> Endpoint:
     served = _served.get(medium)
     if served is None:
         served = _served[medium] = _serve(name, medium, request)
+        if request.tap is not None:
+            medium.on_passed = _teller(request.tap.of_bus(medium.name))
     served.users += 1
     closed = False
 
@@ -99,10 +103,26 @@ def serve_medium(name: str, medium: Medium, request: ServeRequest) -> Endpoint:
         served.users -= 1
         if not served.users:
             del _served[medium]
+            medium.on_passed = None
             served.endpoint.close()
 
     endpoint = served.endpoint
     return Endpoint(overrides=endpoint.overrides, where=endpoint.where, close=close, control=endpoint.control)
+
+
+def _teller(tap: CanTap) -> Callable[[int, str, Frame], None]:
+    """Tells a tap what passes on the bus, if somebody listens there: directions are the host's."""
+
+    def tell(t_ns: int, who: str, frame: Frame) -> None:
+        if not tap.heard:
+            return
+        if who == "error":
+            tap.error_frame(t_ns, frame.id, frame.data)
+            return
+        direction: Literal["sent", "received"] = "sent" if who == "host" else "received"
+        tap.frame(t_ns, direction, frame.id, frame.data, extended=frame.extended, remote=frame.remote)
+
+    return tell
 
 
 def _serve(name: str, medium: Medium, request: ServeRequest) -> _Served:

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import heapq
-import itertools
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Container, Sequence
+from heapq import heapify, heappop, heappush
+from typing import Final, Protocol
 
 from microdrivers.core.units import NS_PER_S
-from microdrivers.fakes.can.frame import (
-    ERROR_FRAME_BITS,
-    INTERFRAME_BITS,
-    Due,
-    Frame,
-    arbitration_rank,
-    frame_bits,
-)
+from microdrivers.fakes.can.frame import ERROR_FRAME_BITS, INTERFRAME_BITS, MOST_BITS, Due, Frame, frame_shape
 
 NEVER_NS = 1 << 63
 
 
 class CanNode(Protocol):
-    """A device on the bus. All times are given to it; it never asks for the present, and they never run backwards."""
+    """A device on the bus. All times are given to it; it never asks for the present, and they never run backwards.
+
+    A node may have an attribute `listens_to`, a container that is replaced by another one, never altered: frames of
+    identifiers that are not in it leave the node as it is, and need not be given to it. Without one, it is given all.
+    """
 
     def receive(self, frame: Frame, t_ns: int) -> Sequence[Due]:
         """A frame of somebody else has ended at `t_ns`."""
@@ -40,9 +36,9 @@ class OnPassed(Protocol):
         """`sender`'s frame has arrived, or was destroyed if not `intact`; None sends an error frame of nobody's."""
 
 
-# Rank in arbitration, number of the offer, frame, sender, whether the others can read it. A plain tuple: one is made
-# for each frame.
-_Offer = tuple[int, int, Frame, object, bool]
+# Rank in arbitration, number of the offer, frame, sender, whether the others can read it, how long it takes (ns). A
+# plain tuple: one is made for each frame.
+_Offer = tuple[int, int, Frame, object, bool, int]
 
 
 class BusTimeline:
@@ -61,15 +57,18 @@ class BusTimeline:
     """
 
     def __init__(self, *, bitrate: int, on_passed: OnPassed) -> None:
-        self.bit_ns = NS_PER_S / bitrate
-        self.interframe_ns = round(INTERFRAME_BITS * self.bit_ns)
+        bit_ns = NS_PER_S / bitrate
+        self.interframe_ns: int = round(INTERFRAME_BITS * bit_ns)
+        self._times_ns: list[int] = [round(bits * bit_ns) for bits in range(MOST_BITS + 1)]
         self._on_passed = on_passed
         self._nodes: list[CanNode] = []
+        self._listens_to: list[Container[int]] = []
+        self._routes: dict[int, list[int]] = {}  # by identifier, whom a frame concerns
         self._events_ns: list[int] = []
         self._next_node_ns = NEVER_NS
         self._future: list[tuple[int, _Offer]] = []  # heap by time; they compete later
         self._waiting: list[_Offer] = []  # heap by rank; they have competed and lost
-        self._numbers = itertools.count()
+        self._number = 0
         self._current: _Offer | None = None
         self._start_ns = self._end_ns = 0
         self._free_ns = 0
@@ -82,24 +81,26 @@ class BusTimeline:
         """A node is switched on."""
         self._horizon_ns = max(t_ns, self._horizon_ns)
         self._nodes.append(node)
+        self._listens_to.append(_NOTHING)
         self._events_ns.append(NEVER_NS)
         self._advance(len(self._nodes) - 1, self._horizon_ns)
 
     def detach(self, node: CanNode, t_ns: int) -> None:
         """A node is gone, and its frames with it."""
         index = next(index for index, known in enumerate(self._nodes) if known is node)
-        del self._nodes[index], self._events_ns[index]
+        del self._nodes[index], self._listens_to[index], self._events_ns[index]
+        self._routes.clear()
         self._next_node_ns = min(self._events_ns, default=NEVER_NS)
         self.withdraw(node, t_ns)
 
     def ask_nodes(self) -> None:
         """Ask all nodes for their next events again."""
         for index in range(len(self._nodes)):
-            self._note_event(index)
+            self._look_at(index)
 
     # ------------------------------------------------------------------ frames
 
-    def offer(self, sender: object, frame: Frame, t_ns: int, *, readable: bool = True) -> None:
+    def offer(self, sender: object, frame: Frame, t_ns: int, readable: bool = True) -> None:
         """A frame that competes from `t_ns` on, or from what has happened last if that is later.
 
         It is `readable` unless the others can only see an error in it (another bit rate).
@@ -107,15 +108,18 @@ class BusTimeline:
         Raises:
             OutOfRange: it is no classic frame.
         """
-        entry = (arbitration_rank(frame), next(self._numbers), frame, sender, readable)
-        heapq.heappush(self._future, (max(t_ns, self._horizon_ns), entry))
+        rank, bits = frame_shape(frame)
+        self._number = number = self._number + 1
+        duration_ns = self._times_ns[bits if readable else ERROR_FRAME_BITS]
+        ready_ns = t_ns if t_ns > self._horizon_ns else self._horizon_ns
+        heappush(self._future, (ready_ns, (rank, number, frame, sender, readable, duration_ns)))
 
     def withdraw(self, sender: object, t_ns: int) -> None:
         """Take back all frames of a sender, also the one that is on the bus."""
         self._future = [item for item in self._future if item[1][_SENDER] is not sender]
         self._waiting = [entry for entry in self._waiting if entry[_SENDER] is not sender]
-        heapq.heapify(self._future)
-        heapq.heapify(self._waiting)
+        heapify(self._future)
+        heapify(self._waiting)
         if self._current is not None and self._current[_SENDER] is sender:
             self._current = None
             self._free_ns = max(t_ns, self._horizon_ns) + self.interframe_ns
@@ -125,12 +129,17 @@ class BusTimeline:
         hit, now_ns = self._current, max(t_ns, self._horizon_ns)
         sender = None if hit is None else hit[_SENDER]
         if hit is not None and sender is not None:
-            heapq.heappush(self._waiting, hit)
+            heappush(self._waiting, hit)
         self._horizon_ns = now_ns
-        self._occupy((0, 0, _NOBODYS_ERROR, None, False), now_ns, ERROR_FRAME_BITS)
+        self._occupy((0, 0, _NOBODYS_ERROR, None, False, self._times_ns[ERROR_FRAME_BITS]), now_ns)
         return sender
 
     # ------------------------------------------------------------------ time
+
+    def duration_ns(self, frame: Frame | None) -> int:
+        """What a frame takes on the bus, without the interframe space; None is an error frame."""
+        bits = ERROR_FRAME_BITS if frame is None else frame_shape(frame)[1]
+        return self._times_ns[bits]
 
     @property
     def last_event_ns(self) -> int:
@@ -139,9 +148,10 @@ class BusTimeline:
 
     def next_event_ns(self) -> int:
         """When something happens next; `NEVER_NS` if all is quiet."""
-        return min(self._end_ns if self._current is not None else self._next_start_ns(), self._next_node_ns)
+        bus_ns = self._end_ns if self._current is not None else self._next_start_ns()
+        return bus_ns if bus_ns < self._next_node_ns else self._next_node_ns
 
-    def play(self, until_ns: int, *, reached: Callable[[], bool] | None = None) -> int:
+    def play(self, until_ns: int, reached: Callable[[], object] | None = None) -> int:
         """Let happen what is due by `until_ns`, in order; returns when something happens next.
 
         It ends early when `reached()` after the end of a frame. Times that have been played already do nothing, nor
@@ -153,84 +163,98 @@ class BusTimeline:
         try:
             while True:
                 node_ns, current = self._next_node_ns, self._current
-                if current is not None:
-                    bus_ns = self._end_ns
-                    on_bus = bus_ns <= node_ns
-                else:
-                    bus_ns = self._next_start_ns()
-                    on_bus = bus_ns < node_ns
-                if until_ns < (bus_ns if on_bus else node_ns):
-                    return bus_ns if on_bus else node_ns
-                if not on_bus:
+                bus_ns = self._end_ns if current is not None else self._next_start_ns()
+                if node_ns < bus_ns or (node_ns == bus_ns and current is None):
+                    if until_ns < node_ns:
+                        return node_ns
                     self._advance(self._events_ns.index(node_ns), node_ns)
+                elif until_ns < bus_ns:
+                    return bus_ns
                 elif current is None:
                     self._horizon_ns = bus_ns
                     self._begin(bus_ns)
                 else:
                     self._end(current)
                     if reached is not None and reached():
-                        return self.next_event_ns()
+                        break
         finally:
             self._playing = False
+        return self.next_event_ns()
 
     def _next_start_ns(self) -> int:
         if self._waiting:
             return self._free_ns
         if self._future:
-            return max(self._future[0][0], self._free_ns)
+            ready_ns = self._future[0][0]
+            return ready_ns if ready_ns > self._free_ns else self._free_ns
         return NEVER_NS
 
     def _begin(self, t_ns: int) -> None:
         """Arbitrate among what is ready by `t_ns`."""
         waiting, future = self._waiting, self._future
-        while future and future[0][0] <= t_ns:
-            heapq.heappush(waiting, heapq.heappop(future)[1])
-        winner = heapq.heappop(waiting)
-        bits = frame_bits(winner[2]) if winner[4] else ERROR_FRAME_BITS
-        self._occupy(winner, max(t_ns, self._free_ns), bits)
+        if not waiting and len(future) == 1:  # nobody contends
+            winner = future.pop()[1]
+        else:
+            while future and future[0][0] <= t_ns:
+                heappush(waiting, heappop(future)[1])
+            winner = heappop(waiting)
+        self._occupy(winner, t_ns if t_ns > self._free_ns else self._free_ns)
 
-    def _occupy(self, entry: _Offer, start_ns: int, bits: int) -> None:
+    def _occupy(self, entry: _Offer, start_ns: int) -> None:
         self._current = entry
         self._start_ns = start_ns
-        self._end_ns = end_ns = start_ns + round(bits * self.bit_ns)
+        self._end_ns = end_ns = start_ns + entry[_DURATION]
         self._free_ns = end_ns + self.interframe_ns
 
     def _end(self, entry: _Offer) -> None:
-        _, _, frame, sender, intact = entry
+        _, _, frame, sender, intact, _ = entry
         end_ns = self._horizon_ns = self._end_ns
         self._current = None
         self._on_passed(sender, frame, self._start_ns, end_ns, intact)
         if intact:
-            self._hear(frame, sender, end_ns)
+            concerned = self._routes.get(frame.id)
+            if concerned is None or self._next_node_ns <= end_ns:
+                concerned = self._concerned(frame.id, end_ns)
+            for index in concerned:
+                node = self._nodes[index]
+                if node is not sender:
+                    for due_ns, answer in node.receive(frame, end_ns):
+                        self.offer(node, answer, due_ns)
+                    self._look_at(index)
         if self._waiting or (self._future and self._future[0][0] <= end_ns):
             self._begin(end_ns)
 
-    def _hear(self, frame: Frame, sender: object, t_ns: int) -> None:
-        events_ns = self._events_ns
-        for index, node in enumerate(self._nodes):
-            if node is not sender:
-                dues = node.receive(frame, t_ns)
-                if dues:
-                    self._offer_dues(node, dues)
-                event_ns = node.next_event_ns()
-                events_ns[index] = NEVER_NS if event_ns is None else event_ns
-        self._next_node_ns = min(events_ns, default=NEVER_NS)
+    def _concerned(self, identifier: int, t_ns: int) -> list[int]:
+        """To whom a frame is to be given: who listens, and who has something to do at that time."""
+        listening = [index for index, container in enumerate(self._listens_to) if identifier in container]
+        if identifier <= _HIGHEST_STANDARD_ID:
+            self._routes[identifier] = listening
+        due = [index for index, event_ns in enumerate(self._events_ns) if event_ns <= t_ns]
+        return sorted({*listening, *due}) if due else listening
 
     def _advance(self, index: int, t_ns: int) -> None:
         node = self._nodes[index]
         self._horizon_ns = max(t_ns, self._horizon_ns)
-        self._offer_dues(node, node.advance(self._horizon_ns))
-        self._note_event(index)
+        for due_ns, frame in node.advance(self._horizon_ns):
+            self.offer(node, frame, due_ns)
+        self._look_at(index)
 
-    def _offer_dues(self, node: CanNode, dues: Sequence[Due]) -> None:
-        for t_ns, frame in dues:
-            self.offer(node, frame, t_ns)
+    def _look_at(self, index: int) -> None:
+        """Something may have happened in a node."""
+        node, events_ns = self._nodes[index], self._events_ns
+        event_ns = node.next_event_ns()
+        if event_ns is None:
+            event_ns = NEVER_NS
+        if event_ns != events_ns[index]:
+            events_ns[index] = event_ns
+            self._next_node_ns = min(events_ns)
+        listens_to = getattr(node, "listens_to", _ALL_IDS)
+        if listens_to is not self._listens_to[index]:
+            self._listens_to[index] = listens_to
+            self._routes.clear()
 
-    def _note_event(self, index: int) -> None:
-        event_ns = self._nodes[index].next_event_ns()
-        self._events_ns[index] = NEVER_NS if event_ns is None else event_ns
-        self._next_node_ns = min(self._events_ns)
 
-
-_SENDER = 3
+_SENDER: Final = 3
+_DURATION: Final = 5
 _NOBODYS_ERROR = Frame(0)
+_ALL_IDS, _NOTHING, _HIGHEST_STANDARD_ID = range(1 << 29), (), 0x7FF

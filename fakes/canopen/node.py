@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from enum import IntEnum
 from typing import TypedDict
@@ -18,7 +18,7 @@ from microdrivers.fakes.canopen.emergency import HEARTBEAT_LOST, PDO_LENGTH, Eme
 from microdrivers.fakes.canopen.heartbeats import HEARTBEAT_ID, HeartbeatConsumer, HeartbeatProducer
 from microdrivers.fakes.canopen.pdo_record import PdoDefaults
 from microdrivers.fakes.canopen.receive_pdo import ReceivePdo
-from microdrivers.fakes.canopen.sdo_server import SdoServer
+from microdrivers.fakes.canopen.sdo_server import SdoServer, is_upload
 from microdrivers.fakes.canopen.temper import PROMPT, Temper
 from microdrivers.fakes.canopen.transmit_pdo import TransmitPdo, TransmitPdos
 
@@ -32,7 +32,8 @@ _LONG_AGO_NS = -(1 << 62)
 _CLOCK_ERROR = 50e-6
 """Largest relative error of the node's own clock."""
 
-Handler = Callable[[Frame, int], None]
+Handler = Callable[[Frame, int], bool]
+"""Acts on a frame that ended at that time; tells whether anything that falls due by itself may have moved."""
 
 
 class NmtState(IntEnum):
@@ -56,6 +57,7 @@ class CanOpenNode:
         changes_are_events: whether a changed value sends an event-driven PDO.
 
     Attributes:
+        listens_to: what the node does with which frames in its present state, by identifier.
         emergencies: what is wrong; the application tells it.
     """
 
@@ -80,11 +82,12 @@ class CanOpenNode:
         self._random = random.Random(seed)
         self._lock: AbstractContextManager[object] = threading.RLock()
         self._on_disturbed: Callable[[], None] = lambda: None
-        self._handlers: dict[int, Handler] = {}
+        self.listens_to: Mapping[int, Handler] = {}
         self._due: list[Due] = []
         self._withheld: list[bytes] = []
         self._next_ns = self._now_ns = self._sdo_free_ns = self._free_ns = _LONG_AGO_NS
         self._boot_ns: int | None = None
+        self._set_points_wait = False
         self._producer = HeartbeatProducer()
         self._consumer = HeartbeatConsumer(
             on_missed=self._heartbeat_missed, on_back=self._heartbeat_back, on_changed=self._listen
@@ -112,18 +115,22 @@ class CanOpenNode:
         """See `CanNode`."""
         if self._next_ns <= t_ns:
             self._catch_up(t_ns)
-        handler = self._handlers.get(frame.id)
-        if handler is None or frame.extended or frame.remote:
-            return self._finish() if self._due else ()
-        self._now_ns = t_ns
-        handler(frame, t_ns)
-        self._transmit.look(t_ns)
-        return self._finish()
+        handler = self.listens_to.get(frame.id)
+        if handler is not None and not frame.extended and not frame.remote:
+            self._now_ns = t_ns
+            moved = handler(frame, t_ns)
+            if self._transmit.sends_changes:
+                self._transmit.look(t_ns)
+                moved = True
+            if moved:
+                self._plan()
+        return self._take_due() if self._due else ()
 
     def advance(self, t_ns: int) -> Sequence[Due]:
         """See `CanNode`."""
         self._catch_up(t_ns)
-        return self._finish()
+        self._plan()
+        return self._take_due()
 
     def next_event_ns(self) -> int | None:
         """See `CanNode`."""
@@ -177,8 +184,7 @@ class CanOpenNode:
         if self._sdo.deadline_ns is not None and self._sdo.deadline_ns <= t_ns:
             self._reply(self._sdo.time_out(), t_ns)
 
-    def _finish(self) -> Sequence[Due]:
-        self._plan()
+    def _take_due(self) -> Sequence[Due]:
         due, self._due = self._due, []
         return due
 
@@ -225,14 +231,15 @@ class CanOpenNode:
             self._application.restart(t_ns)
         self._listen()
 
-    def _network_management(self, frame: Frame, t_ns: int) -> None:
+    def _network_management(self, frame: Frame, t_ns: int) -> bool:
         if len(frame.data) < 2 or frame.data[1] not in (0, self.node_id):
-            return
+            return False
         command = frame.data[0]
         if command in _COMMANDED_STATES:
             self._enter(_COMMANDED_STATES[command], t_ns)
         elif command in (_RESET_NODE, _RESET_COMMUNICATION):
             self._restart(t_ns, self._temper.reset_s, communication_only=command == _RESET_COMMUNICATION)
+        return True
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
         if state is self.state:
@@ -262,12 +269,13 @@ class CanOpenNode:
         else:
             for pdo in self._receive:
                 pdo.forget()
-        self._handlers = handlers
+        self.listens_to = handlers
 
     # ------------------------------------------------------------------ heartbeats
 
-    def _heartbeat(self, frame: Frame, t_ns: int) -> None:
+    def _heartbeat(self, frame: Frame, t_ns: int) -> bool:
         self._consumer.heard(frame.id - HEARTBEAT_ID, t_ns)
+        return True
 
     def _heartbeat_missed(self, node_id: int, t_ns: int) -> None:
         self.emergencies.happen(HEARTBEAT_LOST, t_ns, info=bytes((node_id,)))
@@ -280,21 +288,28 @@ class CanOpenNode:
 
     # ------------------------------------------------------------------ data
 
-    def _sdo_request(self, frame: Frame, t_ns: int) -> None:
+    def _sdo_request(self, frame: Frame, t_ns: int) -> bool:
+        was_under_way = self._sdo.deadline_ns is not None
         reply = self._sdo.request(frame.data, t_ns)
         if reply is not None:
             self._reply(reply, t_ns)
+        return not is_upload(frame.data) or was_under_way or self._sdo.deadline_ns is not None
 
-    def _sync(self, _frame: Frame, t_ns: int) -> None:
+    def _sync(self, _frame: Frame, t_ns: int) -> bool:
         self._transmit.at_sync(t_ns)
-        for pdo in self._receive:
-            pdo.at_sync(t_ns)
+        waited, self._set_points_wait = self._set_points_wait, False
+        if waited:
+            for pdo in self._receive:
+                pdo.at_sync(t_ns)
+        return waited
 
     def _taker(self, pdo: ReceivePdo) -> Handler:
-        def take(frame: Frame, t_ns: int) -> None:
+        def take(frame: Frame, t_ns: int) -> bool:
             if not pdo.take(frame.data, t_ns):
                 self.emergencies.happen(PDO_LENGTH, t_ns)
                 self.emergencies.pass_by(t_ns, PDO_LENGTH)
+            self._set_points_wait = self._set_points_wait or pdo.waits_for_sync
+            return True
 
         return take
 
@@ -307,7 +322,9 @@ class CanOpenNode:
         }
 
     def _send(self, identifier: int, data: bytes, t_ns: int) -> None:
-        self._free_ns = max(t_ns + self._draw_ns(self._temper.pdo_s), self._free_ns)
+        ready_ns = t_ns + self._draw_ns(self._temper.pdo_s)
+        if ready_ns > self._free_ns:
+            self._free_ns = ready_ns
         self._due.append(Due(self._free_ns, Frame(identifier, data)))
 
     def _reply(self, data: bytes, t_ns: int) -> None:

@@ -51,6 +51,11 @@ class ReceivePdo(PdoRecord):
             self._received = data
         return True
 
+    @property
+    def waits_for_sync(self) -> bool:
+        """Whether something has arrived that is used with the next SYNC."""
+        return self._received is not None
+
     def at_sync(self, t_ns: int) -> None:
         """Use what has arrived since the last SYNC."""
         if self._received is not None:

@@ -31,6 +31,11 @@ class _Transfer:
     toggle: int = 0
 
 
+def is_upload(request: bytes) -> bool:
+    """Whether a request begins to read an object, which changes nothing in the device."""
+    return bool(request) and request[0] & 0xE0 == 0x40
+
+
 class SdoServer:
     """Answers requests; one transfer at a time, a new one takes the place of a half one."""
 

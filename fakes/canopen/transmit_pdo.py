@@ -72,7 +72,8 @@ class TransmitPdo(PdoRecord):
 
     def sample(self, t_ns: int) -> bytes:
         """The bytes at `t_ns`."""
-        return self.pack(*[entry.get(t_ns) for entry in self.mapped if entry is not None])
+        values = [entry.value if entry.read is None else entry.read(t_ns) for entry in self.mapped if entry is not None]
+        return self.pack(*values)
 
     @property
     def event_driven(self) -> bool:
@@ -89,7 +90,9 @@ class TransmitPdo(PdoRecord):
         if self._syncs < every:
             return None
         self._syncs = 0
-        return self._sent(self.sample(t_ns), t_ns)
+        self._last_data = data = self.sample(t_ns)
+        self._sent_ns, self._waits = t_ns, False
+        return data
 
     def on_change(self, t_ns: int) -> bytes | None:
         """What a change makes it send now; within the inhibit time that has to wait."""
@@ -177,6 +180,11 @@ class TransmitPdos:
             data = pdo.at_sync(t_ns)
             if data is not None:
                 self._send(pdo.cob_id, data, t_ns)
+
+    @property
+    def sends_changes(self) -> bool:
+        """Whether a change may send a PDO at present."""
+        return self._cycle_ns is not None
 
     def look(self, t_ns: int) -> None:
         """Something may have changed."""

@@ -168,10 +168,10 @@ class ReplayWorld:
     """The devices of a wire log, each behind `fake://NAME`; see `WorldWithEmulators`.
 
     Says by warnings which devices of the rig it leaves out, where the rig file differs from that of the log, and at
-    the end which requests it had no answer to.
+    the end which requests it had no answer to. CAN buses are not replayed: their devices are left out.
 
     Raises:
-        ConfigError: there is no such log, it is damaged, or it knows no device of the rig.
+        ConfigError: there is no such log, it is damaged, or it knows no device of the rig that can be replayed.
     """
 
     def __init__(self, request: WorldRequest[ReplaySettings]) -> None:
@@ -184,6 +184,13 @@ class ReplayWorld:
             for name, traffic in _by_device(log.records).items()
             if name in devices and (requests := logged_requests(traffic))
         }
+        on_can = [name for name, section in devices.items() if _is_on_can(section)]
+        if not self.replays and len(on_can) == len(devices):
+            raise ConfigError(
+                f"CAN buses are not replayed, and {', '.join(on_can)} {'is' if len(on_can) == 1 else 'are'} on one",
+                file=str(self.file),
+                remedy="read the log: a frame is a line of its own, in candump's notation; or use --fake",
+            )
         if not self.replays:
             raise ConfigError(
                 "nothing passed on the wire of any device of this rig", file=str(self.file),
@@ -192,10 +199,12 @@ class ReplayWorld:
         self.emulators: Mapping[str, Emulator] = {
             name: Emulator(attach=partial(_attach, replay)) for name, replay in self.replays.items()
         }
-        left_out = [name for name in devices if name not in self.replays]
+        if on_can:
+            _log.warning("%s: left out of the rig, for CAN buses are not replayed: %s", self.file, ", ".join(on_can))
+        left_out = [name for name in devices if name not in self.replays and name not in on_can]
         if left_out:
             _log.warning(
-                "%s: left out of the rig, for the log holds nothing of its wire (frames and HTTP are not logged): %s",
+                "%s: left out of the rig, for the log holds nothing of its wire (images and HTTP are not logged): %s",
                 self.file, ", ".join(left_out),
             )  # fmt: skip
         then = log.header.rig.get("devices")
@@ -221,6 +230,12 @@ def _by_device(records: Iterable[LoggedSample]) -> dict[str, list[WireTraffic]]:
         if isinstance(sample, WireTraffic):
             traffic.setdefault(sample.device, []).append(sample)
     return traffic
+
+
+def _is_on_can(section: Mapping[str, Any]) -> bool:
+    """Whether a device's section of the rig file names a CAN bus; a serial line has a port."""
+    connection = section.get("connection")
+    return isinstance(connection, Mapping) and "channel" in connection and "interface" in connection
 
 
 def _attach(replay: ReplayEmulator, request: EmulationRequest) -> Emulation:

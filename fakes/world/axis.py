@@ -5,14 +5,19 @@ from __future__ import annotations
 import bisect
 import math
 import threading
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from microdrivers.core.units import NS_PER_S
 
 _KEPT_SEGMENTS = 4096
+_DRAWN_AT_ONCE = 64
 _ARRIVED_LAGS = 12.0
+_STILL_LAGS = 40.0
+"""After so many time constants what is left of any lag is lost in rounding."""
 _NEGLIGIBLE = 1e-7
 """Distance (µm or degrees) that is no motion: a rounding error must not look like a reversal."""
 
@@ -50,6 +55,8 @@ class Axis:
         self._lost_motion = lost_motion
         self._segments = [_Segment(-(10**18), position, 0.0, 0.0, 0.0, 0.0, 0.0)]
         self._times = [self._segments[0].t_ns]
+        self._commanded_ns: list[int] = []
+        self._listeners: list[Callable[[int], None]] = []
         self._lock = threading.RLock()
 
     # ------------------------------------------------------------------ state at an instant
@@ -69,6 +76,24 @@ class Axis:
         steady = setpoint - tau * speed + tau * tau * segment.acceleration
         return steady + (segment.lag * math.exp(-s / tau) if segment.lag else 0.0)
 
+    def positions_at(self, t_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        """Where the table is at many rising instants."""
+        with self._lock:
+            first = max(bisect.bisect_right(self._times, int(t_ns[0])) - 1, 0)
+            last = max(bisect.bisect_right(self._times, int(t_ns[-1])), first + 1)
+            segments = self._segments[first:last]
+        begins = [0, *np.searchsorted(t_ns, [segment.t_ns for segment in segments[1:]]).tolist(), len(t_ns)]
+        positions = np.empty(len(t_ns))
+        tau = self._lag_s
+        for segment, begin, end in zip(segments, begins, begins[1:], strict=False):
+            s = np.maximum(t_ns[begin:end] - segment.t_ns, 0) / NS_PER_S
+            speed = segment.speed + segment.acceleration * s
+            setpoint = segment.position + segment.speed * s + 0.5 * segment.acceleration * s * s
+            positions[begin:end] = setpoint - tau * speed + tau * tau * segment.acceleration
+            if segment.lag:
+                positions[begin:end] += segment.lag * np.exp(-s / tau)
+        return positions
+
     def speed_at(self, t_ns: int) -> float:
         """How fast the table moves."""
         segment, s = self._segment_at(t_ns)
@@ -85,7 +110,21 @@ class Axis:
         """When the last profile ends (or ended)."""
         return self._times[-1]
 
+    def still_from_ns(self) -> int:
+        """From when on, unless it is commanded again, the position is one and the same number."""
+        return self.profile_end_ns + round(_STILL_LAGS * self._lag_s * NS_PER_S)
+
+    def commanded_ns(self, t_ns: int) -> int | None:
+        """When it was last told to go somewhere, up to `t_ns`; None if never."""
+        with self._lock:
+            i = bisect.bisect_right(self._commanded_ns, t_ns)
+            return self._commanded_ns[i - 1] if i else None
+
     # ------------------------------------------------------------------ commands
+
+    def on_change(self, listener: Callable[[int], None]) -> None:
+        """Call `listener` with the instant from which on a command changes what was planned; it must not ask back."""
+        self._listeners.append(listener)
 
     def move(
         self,
@@ -103,6 +142,8 @@ class Axis:
         braking = acceleration if deceleration is None else deceleration
         with self._lock:
             position, velocity = self._cut(t_ns)
+            bisect.insort(self._commanded_ns, t_ns)
+            del self._commanded_ns[: -2 * _KEPT_SEGMENTS]
             beyond = target - (position + velocity * abs(velocity) / (2.0 * braking))
             if beyond * velocity < 0.0:
                 t_ns, position = self._brake(t_ns, position, velocity, braking)
@@ -150,6 +191,8 @@ class Axis:
 
     def _cut(self, t_ns: int) -> tuple[float, float]:
         """Forget what was planned after `t_ns`; returns the set-point there."""
+        for listener in self._listeners:
+            listener(t_ns)
         state = self.setpoint_at(t_ns)
         keep = max(bisect.bisect_left(self._times, t_ns), 1)
         del self._segments[keep:], self._times[keep:]
@@ -233,13 +276,20 @@ class Encoder:
         self.resolution = resolution
         self.noise = noise
         self.offset = offset
-        self._random = np.random.default_rng(seed)
+        self._next_normal = _standard_normals(seed).__next__
 
     def counts_at(self, t_ns: int) -> int:
         """Whole counts read at an instant; each call draws new noise."""
         true = self.axis.position_at(t_ns) + self.offset
-        return round((true + self._random.normal(0.0, self.noise)) / self.resolution)
+        return round((true + self.noise * self._next_normal()) / self.resolution)
 
     def position_at(self, t_ns: int) -> float:
         """The reading in µm or degrees."""
         return self.counts_at(t_ns) * self.resolution
+
+
+def _standard_normals(seed: int) -> Iterator[float]:
+    """Normally distributed numbers without end; many at once cost a tenth of one at a time."""
+    random = np.random.default_rng(seed)
+    while True:
+        yield from random.standard_normal(_DRAWN_AT_ONCE).tolist()

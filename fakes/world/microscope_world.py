@@ -18,11 +18,15 @@ from microdrivers.core.samples import OpticsTruth
 from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.drivers import WorldRequest
 from microdrivers.fakes.world.axis import Axis
+from microdrivers.fakes.world.contact_truth import ContactTruths
 from microdrivers.fakes.world.optics import Microscope
+from microdrivers.fakes.world.painting import Overlay
 from microdrivers.fakes.world.scene import Look, Speck
 from microdrivers.fakes.world.settings import WorldSettings
+from microdrivers.fakes.world.specimen import Specimen, find_holder, find_probe, nominal_surface_um
+from microdrivers.fakes.world.specimen_views import SpecimenView
 from microdrivers.fakes.world.tools import Tools
-from microdrivers.fakes.world.views import View, coarse_view, lateral_view
+from microdrivers.fakes.world.views import View, coarse_noise_seed, coarse_optics, lateral_view, nothing_px
 
 Array = npt.NDArray[np.float64]
 
@@ -36,19 +40,33 @@ class MicroscopeWorld:
         self.origin_ns = request.clock.now_ns()
         self._truth = request.bus.topic("truth/optics", OpticsTruth, history=4096)
         self._rig = request.rig
+        probe = find_probe(request.rig) if request.settings.specimen.preset != "none" else None
+        self._probe = probe
         random = np.random.default_rng(request.seed)
         self._draw_stage(random)
         self._draw_zoom(random)
         self._draw_optics(random)
         self._draw_target(random)
         self._draw_times(random)
-        tools = Tools(request.rig.get("devices", {}), request.settings.tools, seed=request.seed)
+        holder = find_holder(request.rig, probe) if probe is not None else None
+        tools = Tools(
+            request.rig.get("devices", {}),
+            request.settings.tools,
+            seed=request.seed,
+            holder=holder.name if holder is not None else "",
+        )
         self.fine_stage_axes = tools.axes
         self.fine_stage_home_um = tools.home_um
         self.fine_stage_power_on_offset_um = tools.power_on_offset_um
         self._tools = tools
         self.pressed: dict[str, Callable[[int], float]] = {}
         """By sensor: a force as a function of time that is put on its tip in place of what the tip touches."""
+        self.specimen: Specimen | None = None
+        self._contact_truths: ContactTruths | None = None
+        if probe is not None:
+            own = request.settings.specimen
+            self.specimen = Specimen(own, probe, holder, tools.axes, seed=self.seed, origin_ns=self.origin_ns)
+            self._contact_truths = ContactTruths(request.bus, self.specimen, preset=own.preset, t_ns=self.origin_ns)
 
     def close(self) -> None:
         """A world holds nothing that must be released."""
@@ -65,7 +83,12 @@ class MicroscopeWorld:
     def force_uN(self, sensor: str, t_ns: int) -> float:
         """True force on a sensor's tip along its axis."""
         pressed = self.pressed.get(sensor)
-        return self._tools.force_uN(sensor, t_ns) if pressed is None else pressed(t_ns)
+        if pressed is not None:
+            return pressed(t_ns)
+        force_uN = self._tools.force_uN(sensor, t_ns)
+        if self.specimen is not None and sensor == self.specimen.sensor:
+            force_uN += self.specimen.touch_at(t_ns).force_uN
+        return force_uN
 
     def corners_px(self, t_ns: int) -> Array:
         """The target's corners, 4×2 px from the principal point."""
@@ -74,18 +97,61 @@ class MicroscopeWorld:
         )
 
     def _visible_corners_px(self, t_ns: int) -> Array:
-        corners = self.corners_px(t_ns)
-        return corners if self.settings.target.visible else corners + 1e6
+        return nothing_px(t_ns) if self._target_away(t_ns) else self.corners_px(t_ns)
+
+    def _target_away(self, t_ns: int) -> bool:
+        return not self.settings.target.visible or self.specimen_in_view(t_ns)
+
+    def specimen_in_view(self, t_ns: int) -> bool:
+        """Whether cameras from above see specimen and tools, and not the slide; see docs/decisions/0015.
+
+        They look at what was moved last, probe or slide.
+        """
+        if self.specimen is None:
+            return False
+        if not self._device("sample_stage"):
+            return True
+        slide_ns = _commanded_ns(self.stage_axes, t_ns)
+        probe_ns = _commanded_ns(self.fine_stage_axes[self.specimen.probe.tool.name], t_ns)
+        return probe_ns is not None and (slide_ns is None or slide_ns < probe_ns)
 
     def view(self, camera: str) -> View:
         """What a camera of the rig file sees: the microscope's own, one from the side, or any other from above."""
         section = self._rig.get("devices", {}).get(camera, {})
         if camera == (self._rig.get("microscope") or {}).get("camera", camera):
-            return View(self.look, self._visible_corners_px, (self.seed, 7), self._blobs_px, self.publish_truth)
+            return View(
+                self.look,
+                self._visible_corners_px,
+                (self.seed, 7),
+                self._blobs_px,
+                self.publish_truth,
+                self._overlay(self.microscope, self.zoom_at),
+            )
         if section.get("view") == "lateral":
-            return lateral_view(camera, self.look, self.fine_stage_axes, seed=self.seed)
-        on_stage = lambda t_ns: self._on_stage(self._corners_um, t_ns)  # noqa: E731
-        return coarse_view(camera, self.microscope, self.look, on_stage, seed=self.seed, s=self._s)
+            return lateral_view(camera, self.look, self.fine_stage_axes, self.specimen, seed=self.seed)
+        optics = coarse_optics(camera, self.microscope, seed=self.seed)
+
+        def corners_px(t_ns: int) -> Array:
+            if self.specimen_in_view(t_ns):
+                return nothing_px(t_ns)
+            return optics.project(self._on_stage(self._corners_um, t_ns), zoom=1.0, time_s=self._s(t_ns))
+
+        return View(
+            self.look,
+            corners_px,
+            coarse_noise_seed(camera, seed=self.seed),
+            overlay=self._overlay(optics, lambda _t_ns: 1.0),
+        )
+
+    def _overlay(self, optics: Microscope, zoom_at: Callable[[int], float]) -> Callable[[int, int], Overlay | None]:
+        if self.specimen is None:
+            return lambda _t_ns, _exposure_ns: None
+
+        def project(places_um: Array, t_ns: int) -> Array:
+            return optics.project(places_um[:, :2], zoom=zoom_at(t_ns), time_s=self._s(t_ns))
+
+        seen = SpecimenView(self.specimen, project, blur_px=self.look.blur_px, seed=self.seed)
+        return lambda t_ns, exposure_ns: seen.overlay(t_ns, exposure_ns) if self.specimen_in_view(t_ns) else None
 
     def publish_truth(self, t_ns: int, frame_seq: int) -> None:
         """Put the truth of a frame on the bus, for the report and tests."""
@@ -111,6 +177,8 @@ class MicroscopeWorld:
                 tilt_deg=self.microscope.tilt_deg,
             )
         )
+        if self._contact_truths is not None:
+            self._contact_truths.publish(t_ns, frame_seq)
 
     # ------------------------------------------------------------------ geometry
 
@@ -133,7 +201,7 @@ class MicroscopeWorld:
         return cam
 
     def _blobs_px(self, t_ns: int, origin: Array) -> Array:
-        if not self._specks:
+        if not self._specks or self.specimen_in_view(t_ns):
             return np.empty((0, 4))
         places = np.array([(speck.x_um, speck.y_um) for speck in self._specks])
         scale = self.microscope.scale_per_zoom_px_per_um * self.zoom_at(t_ns)
@@ -206,13 +274,20 @@ class MicroscopeWorld:
             mirrored=bool(random.random() < 0.5),
             tilt_deg=abs(float(random.normal(0.0, world.tilt_spread_deg))),
             tilt_direction_deg=float(random.uniform(-180.0, 180.0)),
-            axis_um=(self.reference_position["x"], self.reference_position["y"]),
+            axis_um=self._middle_um(),
             boresight_px=(
                 float(random.normal(0, world.boresight_spread_px)),
                 float(random.normal(0, world.boresight_spread_px)),
             ),
             drift_um_s=(float(random.normal(0.0, drift)), float(random.normal(0.0, drift))),
         )
+
+    def _middle_um(self) -> tuple[float, float]:
+        """What the microscope looks at: the middle of the sample stage's travel, or where the specimen should be."""
+        if self._probe is not None and not self._device("sample_stage"):
+            x_um, y_um, _ = nominal_surface_um(self._probe).tolist()
+            return x_um, y_um
+        return self.reference_position["x"], self.reference_position["y"]
 
     def _draw_target(self, random: np.random.Generator) -> None:
         world = self.settings.target
@@ -255,6 +330,11 @@ class MicroscopeWorld:
         self.pose_latch_delay_s = max(0.0, latch_ms) / 1000.0
         self.delivery_delay_s = float(random.uniform(*camera.delivery_ms)) / 1000.0
         self.stamp_error_s = float(random.normal(0.0, camera.stamp_spread_ms)) / 1000.0
+
+
+def _commanded_ns(axes: Mapping[str, Axis], t_ns: int) -> int | None:
+    """When any of the axes was told to go somewhere last, up to `t_ns`."""
+    return max((at_ns for axis in axes.values() if (at_ns := axis.commanded_ns(t_ns)) is not None), default=None)
 
 
 def check_world(world: object) -> MicroscopeWorld:

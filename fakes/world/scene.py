@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from microdrivers.fakes.world.painting import Overlay
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -68,7 +71,15 @@ class Renderer:
         down = tilt_v * (2.0 * rows / max(height_px - 1, 1) - 1.0)
         self._background = (look.background_levels + across[None, :] + down[:, None]).astype(np.float32)
 
-    def render(self, corners_px: Array, travel_px: Array, blobs_px: Array, *, random: np.random.Generator) -> Image:
+    def render(
+        self,
+        corners_px: Array,
+        travel_px: Array,
+        blobs_px: Array,
+        *,
+        random: np.random.Generator,
+        overlay: Overlay | None = None,
+    ) -> Image:
         """One frame.
 
         Args:
@@ -76,11 +87,14 @@ class Renderer:
             travel_px: 4×2, how far each corner moved during the exposure (motion blur).
             blobs_px: K×4 rows of u, v, sigma, depth in grey levels.
             random: source of this frame's noise.
+            overlay: what lies over all that.
         """
         image = self._background.copy()
         for u, v, sigma, depth in blobs_px:
             self._add_blob(image, float(u), float(v), float(sigma), float(depth))
         self._add_target(image, corners_px, travel_px)
+        if overlay is not None:
+            overlay.paint(image, blur_px=self.look.blur_px)
         width, height = self.size
         noise = random.standard_normal((height, width), dtype=np.float32)
         image += np.float32(self.look.noise_levels) * noise

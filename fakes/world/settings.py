@@ -90,6 +90,34 @@ class ToolsWorld(DeviceSettings):
     obstacle_stiffness_uN_per_um: float = pydantic.Field(default=50.0, gt=0)
 
 
+class SpecimenWorld(DeviceSettings):
+    """The embryo that the gripper holds before the probe; it is there if the rig has a probe that can press on it.
+
+    A probe is a force sensor on a fine stage whose `origin_um` is stated. `preset` gives the figures that are not
+    stated here, see `Mechanics` for what they mean; `spread` is the relative standard deviation of springs and dampers
+    from seed to seed. The surface lies where 72 % of the probe's way is over, ± `place_spread_um`. Grains are what the
+    embryo is textured with, drawn with that mean distance; those within `cap_um` of the contact point move with it.
+    """
+
+    preset: Literal["none", "single", "unloading_springs", "slip_corrected", "viscoelastic"] = "single"
+    k1_uN_per_um: float | None = pydantic.Field(default=None, gt=0)
+    k2_uN_per_um3: float | None = pydantic.Field(default=None, ge=0)
+    b_loading_uN_s_per_um: float | None = pydantic.Field(default=None, ge=0)
+    b_unloading_uN_s_per_um: float | None = pydantic.Field(default=None, ge=0)
+    m_kg: float | None = pydantic.Field(default=None, ge=0)
+    slip_um: float | None = pydantic.Field(default=None, ge=0)
+    slip_rate_per_s: float | None = pydantic.Field(default=None, ge=0)
+    branch_uN_per_um: float | None = pydantic.Field(default=None, ge=0)
+    branch_s: float | None = pydantic.Field(default=None, gt=0)
+    adhesion_uN: float | None = pydantic.Field(default=None, ge=0)
+    spread: float = pydantic.Field(default=0.0, ge=0, le=0.5)
+    place_spread_um: float = pydantic.Field(default=30.0, ge=0)
+    diameter_um: float = pydantic.Field(default=1300.0, ge=800)
+    cap_um: float = pydantic.Field(default=200.0, ge=0)
+    grain_distance_um: float = pydantic.Field(default=18.0, ge=8)
+    contrast_levels: _Pair = (40.0, 60.0)
+
+
 class ForceWorld(DeviceSettings):
     """The force sensors' imperfections: white noise by device, drift, and the zero that they were switched on with."""
 
@@ -112,4 +140,5 @@ class WorldSettings(DeviceSettings):
     camera: CameraWorld = CameraWorld()
     target: TargetWorld = TargetWorld()
     tools: ToolsWorld = ToolsWorld()
+    specimen: SpecimenWorld = SpecimenWorld()
     force: ForceWorld = ForceWorld()

@@ -14,6 +14,8 @@ from microdrivers.fakes.world.settings import ToolsWorld
 _AXES = ("x", "y", "z")
 _DEFAULT_TRAVEL_UM = (-625.0, 625.0)
 _DEFAULT_DIRECTION = (0.0, 0.0, 1.0)
+_HOLDER_SHARE = 0.04
+"""What holds a specimen stands nearer the middle of its travel by this factor: there it has been loaded."""
 
 
 class Tools:
@@ -23,14 +25,18 @@ class Tools:
     that it sits on. A tool that goes down too far presses on the obstacle, which pushes it up, a linear spring without
     adhesion: the obstacle and the sensor's own spring in series. The sensor feels its axis' share of that push.
 
+    Args:
+        holder: the stage whose tool holds a specimen, if one does.
+
     Attributes:
         axes: of each fine stage, by its name and x, y, z; stage coordinates, µm.
         home_um: where the home switches are.
         power_on_offset_um: what the encoders show beyond the truth before they are referenced.
     """
 
-    def __init__(self, devices: Mapping[str, Any], world: ToolsWorld, *, seed: int) -> None:
+    def __init__(self, devices: Mapping[str, Any], world: ToolsWorld, *, seed: int, holder: str = "") -> None:
         self._world = world
+        self._holder = holder
         self._sensors = {name: section for name, section in devices.items() if "range_uN" in section}
         self.axes: dict[str, dict[str, Axis]] = {}
         self.home_um: dict[str, dict[str, float]] = {}
@@ -46,6 +52,9 @@ class Tools:
             low, high = section["axes"][axis].get("travel_um", _DEFAULT_TRAVEL_UM)
             home[axis] = low
             start[axis] = float(random.uniform(low + 0.4 * (high - low), low + 0.6 * (high - low)))
+            if name == self._holder:
+                middle = 0.5 * (low + high)
+                start[axis] = middle + _HOLDER_SHARE * (start[axis] - middle)
         lag_s = self._world.servo_lag_ms / 1000.0
         self.axes[name] = {axis: Axis(start[axis], lag_s=lag_s) for axis in _AXES}
         self.home_um[name] = home

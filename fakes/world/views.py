@@ -11,7 +11,10 @@ import numpy.typing as npt
 
 from microdrivers.fakes.world.axis import Axis
 from microdrivers.fakes.world.optics import Microscope
+from microdrivers.fakes.world.painting import Overlay
 from microdrivers.fakes.world.scene import Image, Look, Renderer
+from microdrivers.fakes.world.specimen import Specimen
+from microdrivers.fakes.world.specimen_views import SpecimenView
 
 Array = npt.NDArray[np.float64]
 
@@ -31,6 +34,7 @@ class View:
         look: grey levels and blur.
         corners_px: of the one quadrilateral in view at an instant, 4×2 px from the principal point.
         blobs_px: of an instant and the principal point; rows of u, v, radius (px) and depth (grey levels).
+        overlay: what lies over all that, of an instant and an exposure, px from the principal point; None if nothing.
         noise_seed: of the pixel noise, together with the frame's number.
         publish_truth: of an instant and the frame's number.
     """
@@ -40,6 +44,7 @@ class View:
     noise_seed: tuple[int, ...]
     blobs_px: Callable[[int, Array], Array] = lambda _t_ns, _origin: _NO_BLOBS
     publish_truth: Callable[[int, int], None] = lambda _t_ns, _frame_id: None
+    overlay: Callable[[int, int], Overlay | None] = lambda _t_ns, _exposure_ns: None
 
     def render(
         self,
@@ -54,48 +59,59 @@ class View:
         origin = np.asarray(principal_point_px)
         corners = self.corners_px(t_ns)
         travel = self.corners_px(t_ns + exposure_ns // 2) - self.corners_px(t_ns - exposure_ns // 2)
+        overlay = self.overlay(t_ns, exposure_ns)
         return renderer.render(
             corners + origin,
             travel,
             self.blobs_px(t_ns, origin),
             random=np.random.default_rng((*self.noise_seed, frame_id)),
+            overlay=None if overlay is None else overlay.shifted(origin),
         )
 
 
-def coarse_view(
-    name: str, fine: Microscope, look: Look, on_stage: Callable[[int], Array], *, seed: int, s: Callable[[int], float]
-) -> View:
-    """The target from above at a fixed, low magnification, through optics with a rotation of their own.
-
-    `on_stage` gives the target's corners in the stage's plane, `s` an instant as seconds of the world.
-    """
+def coarse_optics(name: str, fine: Microscope, *, seed: int) -> Microscope:
+    """Of a camera from above with a fixed, low magnification and a rotation of its own; project with zoom 1."""
     random = np.random.default_rng((seed, 13, zlib.crc32(name.encode())))
-    optics = fine._replace(
+    return fine._replace(
         scale_per_zoom_px_per_um=_COARSE_SHARE_OF_SCALE * fine.scale_per_zoom_px_per_um,
         angle_deg=float(random.uniform(-180.0, 180.0)),
         boresight_px=(0.0, 0.0),
     )
-    return View(
-        look=look,
-        corners_px=lambda t_ns: optics.project(on_stage(t_ns), zoom=1.0, time_s=s(t_ns)),
-        noise_seed=(seed, 13, zlib.crc32(name.encode())),
-    )
 
 
-def lateral_view(name: str, look: Look, stages: Mapping[str, Mapping[str, Axis]], *, seed: int) -> View:
-    """From the side: the end of the first fine stage's tool, its x to the right and its z up; empty without a stage."""
+def coarse_noise_seed(name: str, *, seed: int) -> tuple[int, ...]:
+    """Of the pixel noise of such a camera."""
+    return seed, 13, zlib.crc32(name.encode())
+
+
+def lateral_view(
+    name: str, look: Look, stages: Mapping[str, Mapping[str, Axis]], specimen: Specimen | None, *, seed: int
+) -> View:
+    """From the side, the rig's x to the right and its z up: the specimen's outline and its tools.
+
+    Without a specimen it is the end of the first fine stage's tool, which comes from above; empty without a stage.
+    """
+    noise_seed = (seed, 17, zlib.crc32(name.encode()))
+    if specimen is not None:
+
+        def project(places_um: Array, _t_ns: int) -> Array:
+            return np.asarray(_LATERAL_PX_PER_UM * (places_um - specimen.surface_um)[:, [0, 2]] * np.array([1.0, -1.0]))
+
+        seen = SpecimenView(specimen, project, blur_px=look.blur_px, upright=True, seed=seed)
+        return View(look, nothing_px, noise_seed, overlay=seen.overlay)
     axes = next(iter(stages.values()), None)
 
     def corners_px(t_ns: int) -> Array:
         if axes is None:
-            return np.asarray(1e6 + np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
+            return nothing_px(t_ns)
         x_um, z_um = axes["x"].position_at(t_ns), axes["z"].position_at(t_ns)
         half, length = 0.5 * _TIP_UM[0], _TIP_UM[1]
         side_um = np.array([[-half, 0.0], [half, 0.0], [half, length], [-half, length]]) + np.array([x_um, z_um])
         return np.asarray(_LATERAL_PX_PER_UM * side_um * np.array([1.0, -1.0]), dtype=np.float64)
 
-    return View(
-        look=look._replace(contrast_levels=-abs(look.contrast_levels)),
-        corners_px=corners_px,
-        noise_seed=(seed, 17, zlib.crc32(name.encode())),
-    )
+    return View(look._replace(contrast_levels=-abs(look.contrast_levels)), corners_px, noise_seed)
+
+
+def nothing_px(_t_ns: int) -> Array:
+    """Corners of a quadrilateral that no picture shows."""
+    return np.asarray(1e6 + np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shlex
 import sys
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.output import describe_rig, prepare_folder
 from microdrivers.cli.progress import TerminalProgress
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
 
@@ -116,24 +116,8 @@ def _on_rig(
         file, fake=fake, seed=seed or 0, clock=clock, world=world, devices="microscope", wire_log=wire_log
     ) as rig:
         settings = CircleSettings(**circle)
-        provenance = {
-            "source": "emulated rig" if fake else "emulated rig on ports" if rig.file.emulated else "live rig",
-            "clock": "simulated" if clock.simulated else "system",
-            "rig_name": rig.file.name,
-            "rig_file": str(rig.description.file),
-            "rig": rig.description.as_data(),
-            "fake": fake or rig.file.emulated,
-            "seed": seed if fake else None,
-            "devices": {name: _info(device) for name, device in rig.devices.items()},
-            "settings": dict(settings._asdict()),
-        }
+        provenance = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict())
         return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress)
-
-
-def _info(device: Any) -> dict[str, str]:
-    import msgspec
-
-    return {key: str(value) for key, value in msgspec.structs.asdict(device.info).items()}
 
 
 def _run(
@@ -148,7 +132,7 @@ def _run(
     from microdrivers.routines.optics.calibration import build_result
     from microdrivers.routines.provenance import describe_run
 
-    folder = _prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics")
+    folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics")
     truth = OpticsTruthCollector(source.bus)
     run = calibrate_optics(source, progress=progress)
     if not run.estimates and not run.complete:
@@ -176,21 +160,3 @@ def _run(
         click.echo(optics_summary(result))
         click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html")
     return run.complete
-
-
-def _prepare_folder(folder: Path) -> Path:
-    """Find out before the experiment whether its result can be written."""
-    from microdrivers.core.errors import ConfigError
-
-    existed = folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-        if not existed:
-            folder.rmdir()  # a failed run leaves nothing behind
-    except OSError as error:
-        raise ConfigError(
-            f"nothing can be written there: {error.strerror}", file=str(folder), remedy="choose another --out folder"
-        ) from error
-    return folder

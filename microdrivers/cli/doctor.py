@@ -33,7 +33,8 @@ def doctor(choice: RigChoice, motion: bool, yes: bool, as_json: bool) -> None:
 
     Each device is opened by itself, so that one failure does not hide the others. Measured: the time of 20 reads,
     the rate of one second's stream, how well the time of a sample is known; of a camera also lost frames, saturation,
-    and whether grab() returns frames exposed after the call.
+    and whether grab() returns frames exposed after the call; of a CAN bus its load while all its devices stream, and
+    its errors.
 
     --motion compares sign and size of small steps with the stage's own encoder. It cannot see a wrong sign that
     motor and encoder share: only the camera can (`microdrivers calibrate optics`). The axes of an emulated stage are
@@ -91,6 +92,11 @@ def _lines(diagnosis: Diagnosis, where: str) -> Iterator[str]:
         yield ""
         yield click.style(device.name, bold=True) + f"  {device.driver}"
         for finding in device.findings:
+            yield from _finding_lines(finding)
+    for bus in diagnosis.buses:
+        yield ""
+        yield click.style(bus.name, bold=True) + f"  shared by {', '.join(bus.devices)}"
+        for finding in bus.findings:
             yield from _finding_lines(finding)
     problems, warnings = diagnosis.count("problem"), diagnosis.count("warning")
     yield ""

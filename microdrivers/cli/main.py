@@ -49,6 +49,7 @@ def main(debug: bool) -> None:
       microdrivers calibrate optics                      the paper's experiment on an emulated workstation
       microdrivers calibrate optics --rig lab.yaml --fake
       microdrivers calibrate optics --images DIR         from a recorded image sequence
+      microdrivers calibrate force                       a specimen's springs and damper, emulated
       microdrivers check lab.yaml                        validate a rig file without hardware
       microdrivers doctor lab.yaml                       what is wrong with the rig, and what to try
       microdrivers reference lab.yaml --axes x,y         find the reference of a stage (moves!)
@@ -113,6 +114,7 @@ def calibrate() -> None:
 
 
 _add(calibrate, "optics", "microdrivers.cli.calibrate", "optics", "Camera to stage, through a zoom change.")
+_add(calibrate, "force", "microdrivers.cli.calibrate_force", "force", "A specimen's springs and damper.")
 _add(main, "check", "microdrivers.cli.check", "check", "Validate a rig file without touching hardware.")
 _add(main, "status", "microdrivers.cli.status", "status", "Who answers, and in which state; nothing moves.")
 _add(main, "doctor", "microdrivers.cli.doctor", "doctor", "Examine every device: what is wrong, what to try.")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from microdrivers.rig import Rig
 
 
-WIRE_LOG_HELP = "Write the bytes to and from devices to FILE, which must not exist yet. Frames and HTTP are not logged."
+WIRE_LOG_HELP = "Write the bytes to and from devices to FILE, which must not exist yet. Images and HTTP are not logged."
 
 
 class RigChoice(NamedTuple):

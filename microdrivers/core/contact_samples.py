@@ -103,3 +103,29 @@ class ContactTruth(Sample, frozen=True, gc=False, kw_only=True):
     tip_um: float
     force_uN: float
     in_contact: bool
+
+
+class SpecimenTruth(Sample, frozen=True, gc=False, kw_only=True):
+    """Ground truth of a simulated specimen; on `truth/specimen`, once, when the simulation is built.
+
+    Attributes:
+        preset: its name. sensor: the force sensor that can press on it.
+        surface_um: where its undeformed surface lies, in the rig's frame.
+        slip_um, slip_rate_per_s: offset and α of Bilen et al., eq. (26); 0 if it does not slip.
+        branch_uN_per_um, branch_s: stiffness and relaxation time of a Maxwell element beside eq. (21); 0: none.
+        adhesion_uN: the pull at which the tip comes off.
+    """
+
+    preset: str
+    sensor: str
+    surface_um: tuple[float, float, float]
+    k1_uN_per_um: float
+    k2_uN_per_um3: float
+    b_loading_uN_s_per_um: float
+    b_unloading_uN_s_per_um: float
+    m_kg: float
+    slip_um: float
+    slip_rate_per_s: float
+    branch_uN_per_um: float
+    branch_s: float
+    adhesion_uN: float

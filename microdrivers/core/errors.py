@@ -206,6 +206,10 @@ class TargetLost(DataError):
     """The target is not, or not wholly, in view."""
 
 
+class NoContact(DataError):
+    """The tool met nothing, or the record shows no contact."""
+
+
 class CalibrationError(MicrodriversError):
     """A calibration cannot be computed or used."""
 

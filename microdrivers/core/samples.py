@@ -141,7 +141,11 @@ class Frame(Sample, frozen=True, kw_only=True):
 
 
 class WireTraffic(Sample, frozen=True, gc=False, kw_only=True):
-    """Bytes that a driver has sent (`direction` "sent") or received; `t_ns` is when it handed them over or got them."""
+    """Bytes that a driver has sent (`direction` "sent") or received; `t_ns` is when it handed them over or got them.
+
+    Of a CAN bus: one frame in candump's notation (`60B#4000100000000000`), `device` is the bus and the time of a frame
+    received is when it had arrived.
+    """
 
     direction: Literal["sent", "received"]
     data: bytes

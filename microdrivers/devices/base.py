@@ -66,6 +66,7 @@ class Device(ABC, Generic[SampleT]):
         self._event_seq = 0
         self._stream_rate_hz = 0.0
         self._stream_errors = 0
+        self._lost_reason = ""
 
     # ------------------------------------------------------------------ what a driver supplies
 
@@ -213,6 +214,8 @@ class Device(ABC, Generic[SampleT]):
         return seq
 
     def _publish_event(self, kind: EventKind, *, by: str = "", reason: str = "") -> None:
+        if kind == "link_lost":
+            self._lost_reason = reason
         seq, self._event_seq = self._event_seq, self._event_seq + 1
         self.events.publish(
             DeviceEvent(
@@ -234,8 +237,9 @@ class Device(ABC, Generic[SampleT]):
 
     def _require_open(self) -> None:
         if self.link != "open":
+            why = f": {self._lost_reason}" if self.link == "lost" and self._lost_reason else ""
             raise LinkLost(
-                f"the device is {self.link}",
+                f"the device is {self.link}{why}",
                 device=self.name,
                 moved="no",
                 remedy="open the rig; if the link was lost, check cable and power, then close and open it again",

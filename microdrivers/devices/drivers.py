@@ -115,7 +115,7 @@ class ServeRequest:
         transport: of serial lines: pseudo-terminals or TCP ports. Cameras are served over HTTP in either case.
         bind: address for TCP and HTTP.
         folder: where stable names of pseudo-terminals are made.
-        tap: is told what passes on a serial line, if somebody wants to know.
+        tap: is told what passes on a serial line, if somebody wants to know; `of_bus` gives that of a CAN bus.
         can: of CAN buses: a serial adapter on a `transport` of its own, or an existing SocketCAN interface.
         can_channel: that interface's name.
     """

@@ -6,9 +6,12 @@ import logging
 import math
 from collections.abc import Mapping
 
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import FineStageSample
 from microdrivers.devices.motion import Move
+from microdrivers.devices.motion_plan import MotionKind, MotionPlan
 from microdrivers.devices.stage import Stage
 
 Vector = tuple[float, float, float]
@@ -21,6 +24,8 @@ class FineStage(Stage[FineStageSample]):
 
     Attributes:
         axes_in_rig: the unit vector of each axis in the rig's frame (a holder may be tilted against the rig).
+        origin_um: where the tip of the tool is in the rig's frame when all axes are at 0; None if the rig file does not
+            say.
         retract_um: the way, in the stage's own axes, that takes the tool away from the sample; None if the rig file
             states none.
     """
@@ -29,7 +34,39 @@ class FineStage(Stage[FineStageSample]):
     axis_names = ("x", "y", "z")
 
     axes_in_rig: Mapping[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+    origin_um: Vector | None = None
     retract_um: Vector | None = None
+
+    def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
+        super().__init__(name, clock=clock, bus=bus)
+        self._retraction: Move[FineStageSample] | None = None
+        self._begins_retraction = False
+
+    @property
+    def retracting(self) -> bool:
+        """Whether the tool is being taken away by `retract()`."""
+        move = self._retraction
+        return self._begins_retraction or (
+            move is not None and move.state == "running" and self.clock.now_ns() < move.deadline_t_ns
+        )
+
+    def tip_um(self, position_um: Mapping[str, float]) -> Vector:
+        """Where the tip of the tool is in the rig's frame when the axes are at this position.
+
+        Raises:
+            UnsupportedError: the rig file does not say where the tip is.
+        """
+        if self.origin_um is None:
+            raise UnsupportedError(
+                "the rig file does not say where the tip of the tool is",
+                device=self.name,
+                remedy="state origin_um: [x, y, z], the tip in the rig's frame when all axes of this stage are at 0",
+            )
+        x, y, z = self.origin_um
+        for axis, (dx, dy, dz) in self.axes_in_rig.items():
+            way = position_um[axis]
+            x, y, z = x + way * dx, y + way * dy, z + way * dz
+        return (x, y, z)
 
     def move_to(
         self,
@@ -69,16 +106,21 @@ class FineStage(Stage[FineStageSample]):
 
         `speed_um_s` is the path speed: all axes start and arrive together. Default: the slowest moved axis' fastest.
         """
+        return self._start({"x": x_um, "y": y_um, "z": z_um}, speed_um_s, "move")
 
+    def _start(
+        self, asked: Mapping[str, float | None], speed_um_s: float | None, kind: MotionKind
+    ) -> Move[FineStageSample]:
         def speeds_of(start: Mapping[str, float], targets: Mapping[str, float]) -> dict[str, float]:
             return self._path_speeds(start, targets, self.axis_names, speed_um_s)
 
-        return self._command({"x": x_um, "y": y_um, "z": z_um}, speeds_of)
+        return self._command(asked, speeds_of, kind)
 
     def retract(self) -> Move[FineStageSample]:
         """Take the tool away from the sample, as fast as the axes allow: by `retract_um` from where it is.
 
-        If the travel ends on the way the tool goes as far along the vector as it can, which is logged.
+        If the travel ends on the way, or something stands in it, the tool goes as far along the vector as it can, which
+        is logged. No force and no lack of force data keeps it from being taken away.
 
         Raises:
             UnsupportedError: the rig file states no way. NotReferenced, LinkLost: nothing has moved.
@@ -89,13 +131,30 @@ class FineStage(Stage[FineStageSample]):
                 device=self.name,
                 remedy="state retract_um: [x, y, z] of this stage in its own axes, for example [0, 0, 500]",
             )
+        self._begins_retraction = True
+        try:
+            self._retraction = self._start(self._way_out(self.retract_um), None, "retraction")
+        finally:
+            self._begins_retraction = False
+        return self._retraction
+
+    def _way_out(self, retract_um: Vector) -> dict[str, float | None]:
+        """Targets that lie as far along the vector as travel and rules allow."""
         here = self.read().position
-        way = dict(zip(self.axis_names, self.retract_um, strict=True))
+        way = dict(zip(self.axis_names, retract_um, strict=True))
         share = min(1.0, *(self._free_share(axis, here[axis], length) for axis, length in way.items()))
+        targets = {axis: here[axis] + share * length for axis, length in way.items()}
+        plan = MotionPlan(kind="retraction", start=here, targets=targets, sweep={}, straight=True)
+        share *= min((rule.free_share(self, plan) for rule in self.rules), default=1.0)
         if share < 1.0:
-            _log.warning("%s: only %.0f %% of retract_um lies within the travel", self.name, 100 * share)
-        targets = {axis: here[axis] + share * length if length else None for axis, length in way.items()}
-        return self.start_move_to(x_um=targets["x"], y_um=targets["y"], z_um=targets["z"])
+            _log.warning("%s: only %.0f %% of retract_um is free", self.name, 100 * share)
+        return {
+            axis: self._within(axis, here[axis] + share * length) if length else None for axis, length in way.items()
+        }
+
+    def _within(self, axis: str, position: float) -> float:
+        """A position that noise or rounding has put beyond the end of the travel, at that end."""
+        return min(max(position, self.limits[axis].min), self.limits[axis].max)
 
     def _free_share(self, axis: str, position: float, length: float) -> float:
         """How much of a way along one axis its travel allows, 0 to 1."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 
 import msgspec
 import numpy as np
@@ -15,6 +16,7 @@ from microdrivers.core.samples import ForceSample, TimeSource
 from microdrivers.core.units import NS_PER_S, Range, check_range
 from microdrivers.devices.base import Device
 from microdrivers.devices.force_sensor_settings import ForceSensorSettings
+from microdrivers.devices.shared_stream import SharedStream
 
 SATURATED, DISCONNECTED, STALE, UNTARED = "SATURATED", "DISCONNECTED", "STALE", "UNTARED"
 INVALID = frozenset({SATURATED, DISCONNECTED, STALE})
@@ -40,8 +42,9 @@ class Tare(msgspec.Struct, frozen=True, kw_only=True):
 class ForceSensor(Device[ForceSample]):
     """One axis of force, µN; two axes are two sensors.
 
-    A driver supplies the hooks of `Device`, fills the attributes (`_adopt`), and makes its samples with `_sample`.
-    Nothing is tared by itself. While a stream is open and no reading comes, samples without a force say so: STALE.
+    A driver supplies the hooks of `Device`, fills the attributes (`_adopt`), and makes its samples with `_sample`; one
+    whose amplifier streams by itself also supplies `_stream_at`. Nothing is tared by itself. While a stream is open and
+    no reading comes, samples without a force say so: STALE.
 
     Attributes:
         range_uN: beyond it a reading is SATURATED.
@@ -66,6 +69,7 @@ class ForceSensor(Device[ForceSample]):
         super().__init__(name, clock=clock, bus=bus)
         self.tares: tuple[Tare, ...] = ()
         self._tare: Tare | None = None
+        self._shared = SharedStream(self._stream_at, lambda: self.streaming)
 
     # ------------------------------------------------------------------ public
 
@@ -95,7 +99,23 @@ class ForceSensor(Device[ForceSample]):
         self._tare = None
         self._publish_event("tared", reason="cleared")
 
+    @contextmanager
+    def stream(self, rate_hz: float) -> Iterator[None]:
+        """Publish samples on topic `<name>` while the context is open, at `rate_hz` or faster.
+
+        All who want a stream share one, a force guard and a routine for instance; the highest rate holds.
+
+        Raises:
+            OutOfRange: the sensor or its line cannot. LinkError: it does not answer.
+        """
+        with self._shared.at(rate_hz):
+            yield
+
     # ------------------------------------------------------------------ for drivers
+
+    def _stream_at(self, rate_hz: float) -> AbstractContextManager[None]:
+        """The sensor's one stream; by default it is polled."""
+        return super().stream(rate_hz)
 
     def _adopt(self, settings: ForceSensorSettings) -> None:
         """Take over what the rig file says."""

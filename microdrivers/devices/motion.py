@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Generic, Literal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Generic, Literal, NamedTuple
 
 import msgspec
 
@@ -35,6 +37,21 @@ class AxisSpec(msgspec.Struct, frozen=True, kw_only=True):
     tolerance: float
 
 
+class StopNote(NamedTuple):
+    """Who stopped a device, why, and what to do about it; empty where nobody has said."""
+
+    by: str = ""
+    reason: str = ""
+    remedy: str = ""
+
+    def explain(self, error: MoveCancelled) -> MoveCancelled:
+        """Add it to the error of what was stopped."""
+        if self.reason and self.reason not in error.what:
+            error.what = f"{error.what} ({self.by}: {self.reason})"
+            error.remedy = self.remedy or error.remedy
+        return error
+
+
 def move_duration_s(*, distance: float, speed: float, acceleration: float) -> float:
     """Duration of a trapezoidal profile from rest to rest; the three share one length unit."""
     if distance <= 0:
@@ -48,6 +65,11 @@ class Move(Generic[SampleT]):
     """A move under way. `wait()` polls the device on the clock and returns the settled sample.
 
     A newer move of the same device supersedes this one; `stop()` cancels it.
+
+    Attributes:
+        due_ns: when each axis should be at rest at the latest, also axes that an older move still has on their way: a
+            device is settled once all its axes are.
+        deadline_t_ns: the latest of these.
     """
 
     def __init__(
@@ -64,11 +86,14 @@ class Move(Generic[SampleT]):
         start: Mapping[str, float],
         axes: Mapping[str, AxisSpec],
         deadline_t_ns: int,
+        others_due_ns: Mapping[str, int] | None = None,
         poll_s: float = 0.02,
     ) -> None:
         self.target = dict(target)
-        self.deadline_t_ns = deadline_t_ns
+        self.due_ns = {**(others_due_ns or {}), **dict.fromkeys(target, deadline_t_ns)}
+        self.deadline_t_ns = max(self.due_ns.values())
         self.state: MoveState = "running"
+        self.stop_note = StopNote()
         self._device = device
         self._clock = clock
         self._read = read
@@ -96,16 +121,17 @@ class Move(Generic[SampleT]):
             self.state = "cancelled"
             self._stop()
 
-    def mark_stopped(self) -> None:
+    def mark_stopped(self, note: StopNote) -> None:
         """The device was stopped by somebody."""
         if self.state == "running":
+            self.stop_note = note
             self.state = "cancelled"
 
     def wait(self, timeout_s: float | None = None) -> SampleT:
         """Wait until the device is settled at the target and within tolerance of it.
 
         Raises:
-            MoveSuperseded, MoveCancelled: it was replaced or stopped.
+            MoveSuperseded, MoveCancelled: it was replaced or stopped; by whom and why, if they said so.
             WrongDirection: an axis moves away from its target; the device was stopped.
             ReferenceLost: the device forgot its reference on the way, as after a power failure; it was stopped.
             NotReached: the deadline (or `timeout_s`) passed; the device was stopped.
@@ -113,27 +139,41 @@ class Move(Generic[SampleT]):
         limit_ns = self.deadline_t_ns
         if timeout_s is not None:
             limit_ns = min(limit_ns, self._clock.now_ns() + seconds_to_ns(timeout_s))
-        while True:
-            sample = self._read()
-            self._raise_if_ended()
-            position = self._position_of(sample)
-            if self._arrived(sample) and not self._misses(position):
-                self.state = "done"
-                return sample
-            self._stop_if_reference_lost(sample)
-            self._stop_if_wrong_way(position)
-            if self._clock.now_ns() >= limit_ns:
-                self._fail_unreached(position, limit_ns)
+        while (sample := self._look(limit_ns)) is None:
             self._clock.sleep(self._poll_s)
+        return sample
+
+    def look(self) -> SampleT | None:
+        """Look at the device once, without waiting: the settled sample, or None while the move is under way.
+
+        Raises:
+            MotionError: as `wait`.
+        """
+        return self._look(self.deadline_t_ns)
+
+    def _look(self, limit_ns: int) -> SampleT | None:
+        sample = self._read()
+        self._raise_if_ended()
+        position = self._position_of(sample)
+        if self._arrived(sample) and not self._misses(position):
+            self.state = "done"
+            return sample
+        self._stop_if_reference_lost(sample)
+        self._stop_if_wrong_way(position)
+        if self._clock.now_ns() >= limit_ns:
+            self._fail_unreached(position, limit_ns)
+        return None
 
     def _raise_if_ended(self) -> None:
         if self.state == "superseded":
             raise MoveSuperseded("a newer move replaced this one", device=self._device)
         if self.state == "cancelled":
-            raise MoveCancelled(
-                "the move was stopped before it reached its target",
-                device=self._device,
-                remedy="check why the stop was requested, read the position, then command a new move",
+            raise self.stop_note.explain(
+                MoveCancelled(
+                    "the move was stopped before it reached its target",
+                    device=self._device,
+                    remedy="check why the stop was requested, read the position, then command a new move",
+                )
             )
 
     def _misses(self, position: Mapping[str, float]) -> list[str]:
@@ -187,27 +227,73 @@ class MoveSlot(Generic[SampleT]):
     """The one move that a device may have under way.
 
     A stop may come from any thread, also between commanding a move and putting it here: it counts all the same.
+
+    Attributes:
+        stops: how often the device was stopped. last_stop: by whom and why the last time.
     """
 
     def __init__(self) -> None:
+        self.stops = 0
+        self.last_stop = StopNote()
         self._current: Move[SampleT] | None = None
-        self._stops = 0
+        self._commanding = 0
+        self._counting = threading.Lock()
+
+    @property
+    def due_ns(self) -> Mapping[str, int]:
+        """`Move.due_ns` of what is under way: also of a move that was superseded, for its axes go on."""
+        move = self._current
+        return move.due_ns if move is not None and move.state in ("running", "superseded") else {}
+
+    @property
+    def commanding(self) -> bool:
+        """Whether somebody is about to set the device in motion, or is searching a reference."""
+        return self._commanding > 0
+
+    @contextmanager
+    def begin(self) -> Iterator[int]:
+        """While the context is open somebody sets the device in motion; gives what `stops` was before."""
+        with self._counting:
+            self._commanding += 1
+        stops_before = self.stops
+        try:
+            yield stops_before
+        except MoveCancelled as error:
+            if self.stops != stops_before:
+                self.last_stop.explain(error)
+            raise
+        finally:
+            with self._counting:
+                self._commanding -= 1
+
+    def refuse_after_stop(self, stops_before: int) -> None:
+        """Go on only if nobody has stopped the device since.
+
+        Raises:
+            MoveCancelled: somebody has; nothing was commanded.
+        """
+        if self.stops != stops_before:
+            raise MoveCancelled(
+                "a stop was sent while the move was being prepared", moved="no",
+                remedy="check why the stop was requested, then command a new move",
+            )  # fmt: skip
 
     def supersede(self) -> int:
         """A newer move is about to be commanded; returns what `hold` needs to know whether a stop came meanwhile."""
         if self._current is not None:
             self._current.supersede()
-        return self._stops
+        return self.stops
 
     def hold(self, move: Move[SampleT], stops_before: int) -> Move[SampleT]:
         """The newer move has been commanded."""
         self._current = move
-        if self._stops != stops_before:
-            move.mark_stopped()
+        if self.stops != stops_before:
+            move.mark_stopped(self.last_stop)
         return move
 
-    def stopped(self) -> None:
+    def stopped(self, note: StopNote | None = None) -> None:
         """The device is being stopped."""
-        self._stops += 1
+        self.last_stop = note or StopNote()
+        self.stops += 1
         if self._current is not None:
-            self._current.mark_stopped()
+            self._current.mark_stopped(self.last_stop)

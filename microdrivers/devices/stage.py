@@ -13,7 +13,8 @@ from microdrivers.core.errors import NotReferenced, OutOfRange, StaleData
 from microdrivers.core.samples import PoseSample
 from microdrivers.core.units import Range, check_range, seconds_to_ns
 from microdrivers.devices.base import Device
-from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, move_duration_s
+from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, StopNote, move_duration_s
+from microdrivers.devices.motion_plan import MotionKind, MotionPlan, MotionRule
 
 MOVE_MARGIN_S = 0.5
 _RECENT_AT_REST_S = 0.1
@@ -35,6 +36,7 @@ class Stage(Device[PoseT]):
         axis_names: all axes, in their order.
         axes: what is known of each.
         settle_s: how long a move may take to settle after its profile has ended.
+        rules: what the rig allows, asked after the stage's own checks and before anything moves.
     """
 
     axis_names: ClassVar[tuple[str, ...]]
@@ -44,8 +46,10 @@ class Stage(Device[PoseT]):
 
     def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
         super().__init__(name, clock=clock, bus=bus)
+        self.rules: tuple[MotionRule, ...] = ()
         self._move: MoveSlot[PoseT] = MoveSlot()
         self._commanded_ns = -1
+        self._fastest: dict[str, float] = {}
 
     # ------------------------------------------------------------------ what a driver supplies
 
@@ -96,27 +100,41 @@ class Stage(Device[PoseT]):
         check_range(speed, limits, what=f"speed of axis {axis}", unit=f"{unit}/s", device=self.name)
         return self._command({axis: position}, lambda _start, _targets: {axis: speed})
 
+    @property
+    def may_be_moving(self) -> bool:
+        """Whether something was commanded, or is being searched, that is not known to have ended."""
+        return self._move.commanding or self.clock.now_ns() < max(self._move.due_ns.values(), default=-1)
+
+    @property
+    def being_commanded(self) -> bool:
+        """Whether somebody is about to set the stage in motion, or is searching a reference."""
+        return self._move.commanding
+
     def reference(self, axes: Sequence[str]) -> None:
         """Find the reference of the named axes, in exactly that order. Moves the stage to its switches.
 
         Raises:
-            OutOfRange: an unknown or repeated axis. DeviceFault, NotReached: referencing failed.
+            OutOfRange: an unknown or repeated axis. UnsafeError: a rule of the rig forbids it now.
+            DeviceFault, NotReached: referencing failed. MoveCancelled: it was stopped.
         """
-        with self._naming_errors():
+        with self._naming_errors(), self._move.begin() as stops_before:
             self._require_open()
             if not axes or len(set(axes)) != len(axes) or not set(axes) <= set(self.axis_names):
                 raise OutOfRange(
                     f"axes to reference: {', '.join(axes) or 'none'}",
                     remedy=f"name {', '.join(self.axis_names)} once each",
                 )
+            self._ask_rules(MotionPlan(kind="reference", start={}, targets={}, sweep={}, straight=False))
             self._move.supersede()
+            self._fastest = {}
             for axis in axes:
+                self._move.refuse_after_stop(stops_before)
                 self._reference_axis(axis)
                 self._publish_event("reference_found", reason=f"axis {axis}")
 
-    def stop(self, *, by: str = "user", reason: str = "") -> None:
-        """Stop all axes now; a running `Move` ends as cancelled."""
-        self._move.stopped()
+    def stop(self, *, by: str = "user", reason: str = "", remedy: str = "") -> None:
+        """Stop all axes now; a running `Move` ends as cancelled, which tells these three."""
+        self._move.stopped(StopNote(by, reason, remedy))
         super().stop(by=by, reason=reason)
 
     # ------------------------------------------------------------------ for the kinds of stages
@@ -125,20 +143,28 @@ class Stage(Device[PoseT]):
         self,
         asked: Mapping[str, float | None],
         speeds_of: Callable[[Mapping[str, float], Mapping[str, float]], dict[str, float]],
+        kind: MotionKind = "move",
     ) -> Move[PoseT]:
         """Check targets, command them and supervise; `speeds_of` splits the speed for a start and its targets."""
-        with self._naming_errors():
+        with self._naming_errors(), self._move.begin() as stops_before:
             self._require_open()
             targets = {axis: value for axis, value in asked.items() if value is not None}
             self._check_targets(targets)
-            start = self._recent_pose().position
+            pose = self._recent_pose()
+            start = pose.position
             speeds = speeds_of(start, targets)
-            stops_before = self._move.supersede()
+            plan, fastest = self._plan(pose, targets, speeds, kind)
+            self._ask_rules(plan)
+            self._move.refuse_after_stop(stops_before)
+            self._move.supersede()
+            self._fastest = fastest
             try:
                 self._start_move(targets, speeds)
             finally:
                 self._commanded_ns = self.clock.now_ns()
-        return self._move.hold(self._supervise(start, targets, speeds), stops_before)
+            if self._move.stops != stops_before:
+                self._stop()  # it may have reached the device before the move
+            return self._move.hold(self._supervise(start, targets, speeds), stops_before)
 
     def _shifted(self, shifts: Mapping[str, float]) -> dict[str, float | None]:
         """Absolute targets that lie so far from the last targets, or from the present position if there is none."""
@@ -184,6 +210,32 @@ class Stage(Device[PoseT]):
                 remedy=f"make sure that the way is free, then reference({unknown!r})",
             )
 
+    def _ask_rules(self, plan: MotionPlan) -> None:
+        for rule in self.rules:
+            rule.check(self, plan)
+
+    def _plan(
+        self, pose: PoseT, targets: Mapping[str, float], speeds: Mapping[str, float], kind: MotionKind
+    ) -> tuple[MotionPlan, dict[str, float]]:
+        """What a move will sweep, and how fast each axis may then be.
+
+        One that does not begin at rest brakes first, from any speed that was commanded since.
+        """
+        start, sweep, fastest = pose.position, {}, {}
+        path_speed = math.hypot(*speeds.values())
+        for axis, spec in self.axes.items():
+            goal, speed, now = targets.get(axis, start[axis]), speeds.get(axis, 0.0), 0.0
+            if pose.moving:
+                now = self._fastest.get(axis, spec.max_speed)
+                speed = max(now, path_speed if axis in targets else 0.0)
+                older = pose.target[axis]
+                goal = goal if axis in targets or math.isnan(older) else older
+            aside = now * _RECENT_IN_MOTION_S + now * now / (2.0 * spec.acceleration)
+            sweep[axis] = Range(min(start[axis] - aside, goal), max(start[axis] + aside, goal))
+            fastest[axis] = min(speed, spec.max_speed)
+        plan = MotionPlan(kind=kind, start=start, targets=targets, sweep=sweep, straight=not pose.moving)
+        return plan, fastest
+
     def _recent_pose(self) -> PoseT:
         newest = self.topic.latest
         rests = newest is not None and not newest.moving and newest.t_ns > self._commanded_ns
@@ -216,4 +268,5 @@ class Stage(Device[PoseT]):
             start=start,
             axes=self.axes,
             deadline_t_ns=self.clock.now_ns() + seconds_to_ns(deadline_s),
+            others_due_ns=self._move.due_ns,
         )

@@ -5,9 +5,11 @@ The first line is the header, each further line one record:
     {"t_s": 0.012345678, "device": "sample_stage", "direction": "sent", "text": "POS?\n"}
     {"t_s": 0.015004000, "device": "zoom", "direction": "received", "hex": "01 03 04 00 00 00 20 FB EB"}
     {"t_s": 0.020000000, "device": "zoom", "event": "opened"}
+    {"t_s": 0.021000000, "device": "CAN can0", "direction": "sent", "text": "60B#4000100000000000"}
 
 `t_s` counts from the log's start on the rig's clock. Directions are the host's. `text` and `hex` are two ways to write
-the same bytes. One reply may be spread over several records. See docs/decisions/0012.
+the same bytes. One reply may be spread over several records. Of a CAN bus, which devices share, a record is one frame
+in candump's notation. See docs/decisions/0012.
 """
 
 from __future__ import annotations

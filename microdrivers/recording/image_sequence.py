@@ -6,7 +6,6 @@ sample types, as a live rig does.
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -18,8 +17,8 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
 from microdrivers.core.units import seconds_to_ns
+from microdrivers.recording.table import Table, TableRow
 
-_LARGEST_NUMBER = 1e9
 COLUMNS = ("file", "time_s", "x_um", "y_um", "zoom")
 ZOOM_STEPS_PER_UNIT = 10_000
 """A sequence has no motor: positions are given as zoom in these units."""
@@ -112,82 +111,29 @@ class ImageSequence:
 
 
 def _read_rows(folder: Path) -> list[SequenceRow]:
-    try:
-        return _parse_table(folder)
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        raise ConfigError(
-            f"cannot be read as a table: {error}", file=str(folder / "frames.csv"), remedy="save it as CSV in UTF-8"
-        ) from error
-
-
-def _parse_table(folder: Path) -> list[SequenceRow]:
-    table = folder / "frames.csv"
+    file = folder / "frames.csv"
     if not folder.is_dir():
         raise ConfigError("there is no such folder", file=str(folder), remedy="check the path")
-    if not table.is_file():
+    if not file.is_file():
         raise ConfigError(
             "an image sequence needs a frames.csv",
             file=str(folder), remedy=f"add frames.csv with the columns {', '.join(COLUMNS)}",
         )  # fmt: skip
-    rows: list[SequenceRow] = []
-    with table.open(encoding="utf-8-sig", newline="") as stream:
-        header: list[str] | None = None
-        for number, cells in enumerate(csv.reader(stream), start=1):
-            if not cells or cells[0].lstrip().startswith("#"):
-                continue
-            if header is None:
-                header = [cell.strip() for cell in cells]
-                _check_header(table, number, header)
-                continue
-            row = _parse_row(folder, number, header, cells)
-            if rows and row.t_ns <= rows[-1].t_ns:
-                raise ConfigError(
-                    "time does not increase", file=str(table), line=number, column=header.index("time_s") + 1,
-                    key="time_s", remedy="sort the rows by time and remove repetitions",
-                )  # fmt: skip
-            rows.append(row)
-    if not rows:
-        raise ConfigError("the sequence has no frames", file=str(table), line=1, remedy="add a row for each image")
-    return rows
+    table = Table(file, columns=COLUMNS, numeric=COLUMNS[1:], positive=("zoom",))
+    return [_sequence_row(table, row) for row in table.rows]
 
 
-def _check_header(table: Path, line: int, header: list[str]) -> None:
-    missing = [column for column in COLUMNS if column not in header]
-    if missing:
-        raise ConfigError(
-            f"column {', '.join(missing)} is missing (found: {', '.join(header)})",
-            file=str(table), line=line, column=1, remedy=f"the header must name {', '.join(COLUMNS)}",
-        )  # fmt: skip
-
-
-def _parse_row(folder: Path, line: int, header: list[str], cells: list[str]) -> SequenceRow:
-    table = str(folder / "frames.csv")
-    if len(cells) < len(header):
-        raise ConfigError(
-            f"the row has {len(cells)} cells, the header {len(header)}",
-            file=table, line=line, column=len(cells), remedy="complete the row",
-        )  # fmt: skip
-    cell = dict(zip(header, cells, strict=False))
-    numbers: dict[str, float] = {}
-    for key in COLUMNS[1:]:
-        try:
-            numbers[key] = float(cell[key])
-        except ValueError:
-            numbers[key] = math.nan
-        if not abs(numbers[key]) < _LARGEST_NUMBER or (key == "zoom" and numbers[key] <= 0):
-            above = " above zero" if key == "zoom" else ""
-            raise ConfigError(
-                f"{cell[key]!r} is not a finite number{above}", file=table, line=line,
-                column=header.index(key) + 1, key=key,
-                remedy="write a plain number in the unit that the column's name states",
-            )  # fmt: skip
-    image = folder / cell["file"].strip()
+def _sequence_row(table: Table, row: TableRow) -> SequenceRow:
+    image = table.file.parent / row.cells["file"].strip()
     if not image.is_file():
-        raise ConfigError(
-            f"there is no image {cell['file']!r}", file=table, line=line, column=header.index("file") + 1, key="file",
+        raise table.error(
+            row, "file", f"there is no image {row.cells['file']!r}",
             remedy="add the image beside frames.csv, or remove its line",
         )  # fmt: skip
-    return SequenceRow(line, image, seconds_to_ns(numbers["time_s"]), numbers["x_um"], numbers["y_um"], numbers["zoom"])
+    numbers = row.numbers
+    return SequenceRow(
+        row.line, image, seconds_to_ns(numbers["time_s"]), numbers["x_um"], numbers["y_um"], numbers["zoom"]
+    )
 
 
 def _size(shape: tuple[int, ...]) -> str:

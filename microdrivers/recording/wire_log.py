@@ -12,11 +12,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Literal, TextIO
 
-from microdrivers.core.bus import Bus
+from microdrivers.core.bus import Bus, Subscription
 from microdrivers.core.clock import utc_now
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import DeviceEvent, WireTraffic
 from microdrivers.devices.wire_log_format import LoggedSample, WireLogHeader, header_line, record_line
+from microdrivers.devices.wire_tap import WIRE_SUFFIX
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +37,9 @@ def describe_source(
 
 
 class WireLogWriter:
-    """Listens to the wires and events of devices and writes each record as it comes, until it is closed.
+    """Listens to a rig's wires and the events of its devices and writes each record as it comes, until it is closed.
+
+    Buses that devices share are listened to if they are known by then; see `listen_to_buses`.
 
     Publishers only put their samples in a queue: a slow disk delays no exchange and no stop. A log that cannot be
     written any further says so once and lets the rig go on. A log without a record is removed again.
@@ -51,16 +54,24 @@ class WireLogWriter:
         self._start_ns = start_ns
         self._stream = _create(file, header)
         self._queue: SimpleQueue[LoggedSample | None] = SimpleQueue()
-        self._subscriptions = [
-            subscription
-            for name in devices
-            for subscription in (
-                bus.topic(f"{name}/wire", WireTraffic).subscribe(self._queue.put),
-                bus.topic(f"{name}/event", DeviceEvent).subscribe(self._queue.put),
-            )
-        ]
+        self._bus = bus
+        self._subscriptions: dict[str, Subscription] = {}
+        for name in devices:
+            self._listen(f"{name}{WIRE_SUFFIX}", WireTraffic)
+            self._listen(f"{name}/event", DeviceEvent)
+        self.listen_to_buses()
         self._thread = threading.Thread(target=self._write_all, name="wire log", daemon=True)
         self._thread.start()
+
+    def listen_to_buses(self) -> None:
+        """Listen also to the buses that have become known since."""
+        for topic in self._bus.topics:
+            if topic.endswith(WIRE_SUFFIX):
+                self._listen(topic, WireTraffic)
+
+    def _listen(self, topic: str, kind: type[WireTraffic] | type[DeviceEvent]) -> None:
+        if topic not in self._subscriptions:
+            self._subscriptions[topic] = self._bus.topic(topic, kind).subscribe(self._queue.put)
 
     def close(self) -> None:
         """Write what is left and close the file; idempotent."""
@@ -84,7 +95,7 @@ class WireLogWriter:
             _log.error("%s ends after %d records: %s", self.file, self.records, error.strerror)
 
     def _listen_no_more(self) -> None:
-        for subscription in self._subscriptions:
+        for subscription in self._subscriptions.values():
             subscription.cancel()
 
 

@@ -14,7 +14,8 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 
 from microdrivers.report.optics_quantities import settled_index, zoom_name
 from microdrivers.report.svg import BLUE, INK, MOVING, MUTED, ORANGE, SHADE, WIDTH_IN, inline_svg, page_style
-from microdrivers.results.optics import OpticsResult, Trace
+from microdrivers.results.optics import OpticsResult
+from microdrivers.results.record import Trace
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from itertools import pairwise
 from statistics import median, quantiles
 from typing import NamedTuple
@@ -70,31 +69,6 @@ class SettledError(NamedTuple):
     median_px: float
     largest_of_95_percent_px: float
     frames: int
-
-
-class RunKind(NamedTuple):
-    """Where the data come from: `key` is simulated, recorded or real."""
-
-    key: str
-    label: str
-
-
-def run_kind(result: OpticsResult) -> RunKind:
-    """Simulated, recorded or real; a recording of a simulation is simulated."""
-    recorded = result.provenance.clock == "recorded"
-    if result.provenance.fake:
-        return RunKind("simulated", "simulated, from a recording" if recorded else "simulated")
-    return RunKind("recorded", "recorded") if recorded else RunKind("real", "real hardware")
-
-
-def created(result: OpticsResult) -> str:
-    """When the result was made, UTC to the minute; as it stands in the result if that is no ISO 8601 time."""
-    text = result.provenance.created_utc
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        return text
-    return f"{(moment.astimezone(UTC) if moment.tzinfo else moment):%Y-%m-%d %H:%M} UTC"
 
 
 def key_quantities(result: OpticsResult) -> list[Quantity]:

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
-import yaml
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from microdrivers.estimators.optics import student_factor
-from microdrivers.report.number_format import MINUS, compact, fixed, significant
+from microdrivers.report.number_format import compact, fixed, significant
 from microdrivers.report.optics_quantities import (
     PAPER_SETTLING,
-    created,
     key_quantities,
     projection_quantities,
-    run_kind,
     settled_error,
     settled_index,
     settling,
     zoom_name,
 )
+from microdrivers.report.page import page
 from microdrivers.results.optics import OpticsResult
 
 _TEMPLATE = "optics_report.html.j2"
-_REPEATING = {
-    "simulated": "A simulated run gives the same bits again with the same version, rig file and seed.",
-    "recorded": "The same recording analysed by the same version gives the same numbers.",
-    "real": "On the rig, the same command repeats the experiment; the numbers then agree within their intervals.",
-}
 
 
 def write_optics_report(result: OpticsResult, file: Path) -> None:
@@ -50,14 +40,10 @@ def optics_report_html(result: OpticsResult) -> str:
     from microdrivers.report.optics_figures import draw_optics_figures
 
     figures = draw_optics_figures(result)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(compact=compact, setting=_setting)
-    source = resources.files("microdrivers.report").joinpath(_TEMPLATE).read_text(encoding="utf-8")
-    kind = run_kind(result)
-    return environment.from_string(source).render(
-        result=result,
-        kind=kind,
-        created=created(result),
+    return page(
+        _TEMPLATE,
+        result,
+        title=f"Optical calibration of {result.provenance.rig_name}",
         quantities=key_quantities(result),
         projection=projection_quantities(result),
         settling=settling(result),
@@ -66,8 +52,6 @@ def optics_report_html(result: OpticsResult) -> str:
         error=_error(result),
         figures=figures and {name: Markup(svg) for name, svg in figures._asdict().items() if isinstance(svg, str)},
         captions=_captions(result, figures.off_scale if figures else frozenset()),
-        repeating=_REPEATING[kind.key],
-        rig=yaml.safe_dump(result.provenance.rig, sort_keys=False, allow_unicode=True),
         zoom_name=zoom_name(result.zoom),
     )
 
@@ -163,18 +147,3 @@ def _magnification_caption(result: OpticsResult) -> str:
         f"{text} The paper’s Fig. 7 shows the same step, with a jump while the zoom moves and small variations "
         "afterwards, which it ascribes to the stage not being parallel to the image."
     )
-
-
-def _setting(value: Any) -> str:
-    """A setting as plain text."""
-    if value is None:
-        return "not set"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {_setting(each)}" for key, each in value.items())
-    if isinstance(value, list | tuple):
-        return ", ".join(_setting(each) for each in value)
-    if isinstance(value, int | float):
-        return str(value).replace("-", MINUS, 1) if value < 0 else str(value)
-    return str(value)

@@ -8,13 +8,12 @@ from microdrivers.report.number_format import significant
 from microdrivers.report.optics_quantities import (
     PAPER_SETTLING,
     Quantity,
-    created,
     key_quantities,
-    run_kind,
     settled_error,
     settling,
     zoom_name,
 )
+from microdrivers.report.page import created, run_kind
 from microdrivers.results.optics import OpticsResult
 
 MOST_LINES = 25
@@ -39,7 +38,7 @@ def _heading(result: OpticsResult) -> list[str]:
     provenance = result.provenance
     what = f"{provenance.rig_name}, {result.valid_for.camera}, {zoom_name(result.zoom)}"
     state = "complete" if result.complete else "INTERRUPTED"
-    return [f"Optical calibration of {what}", f"{run_kind(result).label}, {state}, {created(result)}"]
+    return [f"Optical calibration of {what}", f"{run_kind(provenance).label}, {state}, {created(provenance)}"]
 
 
 def _quantities(quantities: list[Quantity]) -> list[str]:

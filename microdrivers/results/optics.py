@@ -9,25 +9,21 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 import yaml
 
 from microdrivers.core.errors import ConfigError
+from microdrivers.results.record import Provenance, Record, Trace
 
 SCHEMA_VERSION = 1
 
 Row = tuple[float, float, float]
-Trace = list[float | None]
 View = Literal["along_plus_z", "along_minus_z_or_mirrored"]
 
 
-class _Record(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Tilt(_Record):
+class Tilt(Record):
     """Bound or interval (95 %) on the angle between optical axis and stage normal.
 
     A planar calibration cannot tell tilt from unequal scales of the stage's axes or the pixels, nor its sign.
@@ -38,7 +34,7 @@ class Tilt(_Record):
     sign_ambiguous: bool = True
 
 
-class ZoomChange(_Record):
+class ZoomChange(Record):
     """How the calibration settled after the zoom change.
 
     Frames are 0-based; iteration 1 is the first frame exposed after the zoom began to move. `iterations_…` are None
@@ -56,7 +52,7 @@ class ZoomChange(_Record):
     posterior_iterations_to_0p1_px_from_end: int | None
 
 
-class Traces(_Record):
+class Traces(Record):
     """One value a frame: what figures 4–7 are drawn from.
 
     `projection` holds p11 p12 p13 p21 p22 p23 (px/µm, px from the principal point).
@@ -75,7 +71,7 @@ class Traces(_Record):
     angle_deg: Trace
 
 
-class Truth(_Record):
+class Truth(Record):
     """What the simulation knows, under the result's own names, and the error of each estimate.
 
     `projection` is the affine map that best fits the simulated (perspective) projection over the poses visited
@@ -93,26 +89,7 @@ class Truth(_Record):
     errors: dict[str, float | list[float]]
 
 
-class Provenance(_Record):
-    """Where a result comes from; enough to make it again."""
-
-    microdrivers_version: str
-    created_utc: str
-    command: str
-    source: str
-    rig_name: str
-    rig_file: str
-    rig: dict[str, Any]
-    fake: bool
-    seed: int | None
-    clock: Literal["simulated", "system", "recorded"]
-    devices: dict[str, dict[str, str]]
-    settings: dict[str, Any]
-    python: str
-    platform: str
-
-
-class ValidFor(_Record):
+class ValidFor(Record):
     """The settings that a calibration belongs to; it must not be used with others."""
 
     camera: str
@@ -122,7 +99,7 @@ class ValidFor(_Record):
     zoom: float
 
 
-class OpticsResult(_Record):
+class OpticsResult(Record):
     """An optical calibration, Bilen et al., section III.B.
 
     Attributes:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,7 @@ from microdrivers.core.errors import ConfigError, ConnectError, ErrorTree, Micro
 from microdrivers.devices.base import Device
 from microdrivers.recording.wire_log import WireLogWriter, describe_source
 from microdrivers.rig.rig_file import RigDescription, RigFile, load_rig_file
+from microdrivers.rig.safety import Safety
 from microdrivers.rig.simulation import Simulation
 
 DeviceT = TypeVar("DeviceT", bound=Device[Any])
@@ -26,7 +28,8 @@ _log = logging.getLogger(__name__)
 class Rig:
     """All devices of a rig file, as a context manager.
 
-    Opening connects and identifies and moves nothing; leaving stops everything, in any case, and closes it.
+    Opening connects and identifies and moves nothing; leaving stops everything, in any case, and closes it. `safety`
+    is what the rig file's safety section demands of every move.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class Rig:
                 self.devices[name] = entry.driver.create(name, entry.settings, clock, bus)
             elif name in simulation.emulations:
                 self.devices[name] = entry.driver.create(name, simulation.settings_of(name), clock, bus)
+        self.safety = Safety(description.rig.safety, self.devices, clock=clock, bus=bus)
 
     @property
     def file(self) -> RigFile:
@@ -118,11 +122,23 @@ class Rig:
             raise ErrorTree("not every device could be told to stop:", failures, remedy="use the emergency stop")
 
     def close(self) -> None:
-        """Stop everything, then close everything; whatever fails is logged and does not keep the rest from it."""
+        """Stop everything, then close everything; whatever fails is logged and does not keep the rest from it.
+
+        A tool that the force guard is taking away gets there first, except after Ctrl-C.
+        """
+        try:
+            if not isinstance(sys.exception(), KeyboardInterrupt):
+                self.safety.finish()
+        finally:
+            self._stop_and_close()
+
+    def _stop_and_close(self) -> None:
+        self.safety.disarm()
         try:
             self.stop(by="rig", reason="closing")
         except ErrorTree as error:
             _log.error("%s", error)
+        self.safety.close()
         for device in self.devices.values():
             try:
                 device.close()
@@ -160,22 +176,29 @@ def build_rig(
     seed: int = 0,
     clock: Clock | None = None,
     world: Path | None = None,
-    devices: Collection[str] | Literal["microscope"] | None = None,
+    world_overrides: Mapping[str, Any] | None = None,
+    devices: Collection[str] | Literal["microscope", "probe"] | None = None,
     wire_log: Path | None = None,
     wire_replay: Path | None = None,
 ) -> Rig:
     """Read a rig file and build its devices, closed. See `open_rig`."""
-    if wire_replay is not None and (fake or world is not None):
-        raise ConfigError("wire_replay takes the place of a simulation", remedy="leave out fake and world")
+    if wire_replay is not None and (fake or world is not None or world_overrides):
+        raise ConfigError(
+            "wire_replay takes the place of a simulation", remedy="leave out fake, world and world_overrides"
+        )
     description = load_rig_file(file)
     if devices is not None:
-        description = description.restricted_to(description.microscope_devices if devices == "microscope" else devices)
+        parts = {"microscope": description.microscope_devices, "probe": description.probe_devices}
+        description = description.restricted_to(parts[devices] if isinstance(devices, str) else devices)
     if clock is None:
         clock = SystemClock() if wire_replay is None else SimulatedClock()
     bus = Bus()
     simulation = None
     if fake or wire_replay is not None:
-        simulation = Simulation(description, clock=clock, bus=bus, seed=seed, world_file=world, wire_log=wire_replay)
+        simulation = Simulation(
+            description, clock=clock, bus=bus, seed=seed, world_file=world, world_overrides=world_overrides,
+            wire_log=wire_replay,
+        )  # fmt: skip
     rig = Rig(description, clock=clock, bus=bus, simulation=simulation)
     if wire_log is not None:
         try:
@@ -194,7 +217,8 @@ def open_rig(
     seed: int = 0,
     clock: Clock | None = None,
     world: Path | None = None,
-    devices: Collection[str] | Literal["microscope"] | None = None,
+    world_overrides: Mapping[str, Any] | None = None,
+    devices: Collection[str] | Literal["microscope", "probe"] | None = None,
     wire_log: Path | str | None = None,
     wire_replay: Path | str | None = None,
 ) -> Iterator[Rig]:
@@ -206,8 +230,10 @@ def open_rig(
         seed: which simulated world to draw.
         clock: default is real time; give a `SimulatedClock` to let an emulated rig run as fast as the processor.
         world: a world file for the simulation.
-        devices: open these alone, or those of the microscope; default: all of the file.
-        wire_log: a new file to which everything is written that passes on serial lines. Frames are not.
+        world_overrides: figures in place of the world file's, nested as there: {"specimen": {"preset": "single"}}.
+        devices: open these alone, or those of the microscope or the probe; default: all of the file.
+        wire_log: a new file to which everything is written that passes on serial lines and CAN
+            buses. Images are not.
         wire_replay: a wire log that answers in place of the devices, on a simulated clock unless another one is
             given. Devices that it does not know, cameras for instance, are left out of the rig.
 
@@ -221,6 +247,7 @@ def open_rig(
         seed=seed,
         clock=clock,
         world=world,
+        world_overrides=world_overrides,
         devices=devices,
         wire_log=log,
         wire_replay=replay,

@@ -10,8 +10,10 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from microdrivers.core.errors import ConfigError, UnsupportedError
+from microdrivers.devices.base import Device
 from microdrivers.devices.drivers import DeviceSettings, Driver
 from microdrivers.rig.registry import find_driver, known_drivers
+from microdrivers.rig.safety_section import UNSTATED, SafetyKey, check_safety
 from microdrivers.rig.yaml_file import Document, raise_all, read_document, validate
 
 DeviceName = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
@@ -53,11 +55,24 @@ class MicroscopeSection(DeviceSettings):
     target: SquareTarget | TextureTarget = pydantic.Field(discriminator="kind")
 
 
+class ProbeSection(DeviceSettings):
+    """Which devices press on a specimen, feel it and see it, for `calibrate force`.
+
+    `ready_um` is where the stage (its own axes x, y, z) holds the tip before the specimen, near it and not touching;
+    without it the operator brings the tip there.
+    """
+
+    stage: DeviceName
+    force: DeviceName
+    camera: DeviceName
+    ready_um: tuple[float, float, float] | None = None
+
+
 class RigFile(DeviceSettings):
     """The whole file; each device's section is checked by its driver's own model.
 
     `emulated` says that emulators stand behind the ports, as in a rig file that `microdrivers serve` writes: results
-    are then marked as simulated.
+    are then marked as simulated. `safety` may be left out only where no stage carries a force sensor.
     """
 
     schema_version: Literal[1]
@@ -66,6 +81,8 @@ class RigFile(DeviceSettings):
     emulated: bool = False
     frames: Frames
     microscope: MicroscopeSection | None = None
+    probe: ProbeSection | None = None
+    safety: SafetyKey = UNSTATED
     devices: dict[DeviceName, dict[str, Any]] = pydantic.Field(min_length=1)
 
 
@@ -107,6 +124,15 @@ class RigDescription:
         section = self.rig.microscope
         return tuple(self.devices) if section is None else (section.sample_stage, section.zoom, section.camera)
 
+    @property
+    def probe_devices(self) -> tuple[str, ...]:
+        """Names of the devices that press on a specimen and see it, the microscope's zoom among them."""
+        section, microscope = self.rig.probe, self.rig.microscope
+        if section is None:
+            return tuple(self.devices)
+        zoom = () if microscope is None or section.camera != microscope.camera else (microscope.zoom,)
+        return (section.stage, section.force, section.camera, *zoom)
+
     def as_data(self) -> dict[str, Any]:
         """The whole rig as plain data with all defaults filled in, as worlds and provenance need it."""
         data = self.rig.model_dump(mode="json", exclude={"devices"})
@@ -131,6 +157,7 @@ def load_rig_file(file: Path) -> RigDescription:
         raise AssertionError("unreachable: a rig that failed validation has errors")
     devices, errors = _load_devices(rig.devices, document)
     errors += _check_roles(rig, devices, document) + _check_claims(devices, document)
+    errors += check_safety(rig, devices, document)
     raise_all(document, errors)
     return RigDescription(file=file, rig=rig, devices=devices)
 
@@ -179,23 +206,28 @@ def _check_claims(devices: Mapping[str, DeviceEntry], document: Document) -> lis
 
 
 def _check_roles(rig: RigFile, devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:
-    """The microscope's devices must exist and be of the right kind."""
+    """The devices that the sections `microscope` and `probe` name must exist and be of the right kind."""
     from microdrivers.devices.camera import Camera
+    from microdrivers.devices.fine_stage import FineStage
+    from microdrivers.devices.force_sensor import ForceSensor
     from microdrivers.devices.xytheta_stage import XYThetaStage
     from microdrivers.devices.zoom_motor import ZoomMotor
 
-    if rig.microscope is None:
-        return []
+    sections: dict[str, dict[str, type[Device[Any]]]] = {
+        "microscope": {"sample_stage": XYThetaStage, "zoom": ZoomMotor, "camera": Camera},
+        "probe": {"stage": FineStage, "force": ForceSensor, "camera": Camera},
+    }
     errors = []
-    for role, kind in (("sample_stage", XYThetaStage), ("zoom", ZoomMotor), ("camera", Camera)):
-        name = getattr(rig.microscope, role)
-        where = ("microscope", role)
-        if name not in rig.devices:
-            remedy = f"name one of {', '.join(rig.devices)}"
-            errors.append(document.error(f"there is no device {name!r} in this file", where, remedy=remedy))
-        elif name in devices and not issubclass(devices[name].driver.kind, kind):
-            found = devices[name].driver.kind.__name__
-            errors.append(
-                document.error(f"{name!r} is a {found}, not a {kind.__name__}", where, remedy="name another device")
-            )
+    for title, roles in sections.items():
+        section = getattr(rig, title)
+        for role, kind in roles.items() if section is not None else ():
+            name, where = getattr(section, role), (title, role)
+            if name not in rig.devices:
+                remedy = f"name one of {', '.join(rig.devices)}"
+                errors.append(document.error(f"there is no device {name!r} in this file", where, remedy=remedy))
+            elif name in devices and not issubclass(devices[name].driver.kind, kind):
+                found = devices[name].driver.kind.__name__
+                errors.append(
+                    document.error(f"{name!r} is a {found}, not a {kind.__name__}", where, remedy="name another device")
+                )
     return errors

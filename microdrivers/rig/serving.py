@@ -63,7 +63,7 @@ class ServedRig:
     """The emulators of a rig in real time, each on an endpoint. Close it to end them all.
 
     CAN buses stand behind a serial adapter (slcan) each, or on the existing SocketCAN interface `can_interface`. With
-    `wire_log`, what passes on serial lines is written to that new file as their emulators see it.
+    `wire_log`, what passes on serial lines and CAN buses is written to that new file as their emulators see it.
 
     Raises:
         UnsupportedError: a driver has no emulator, or one that cannot be served; all such devices are named.
@@ -106,6 +106,8 @@ class ServedRig:
             for name, emulation in self.simulation.emulations.items():
                 assert emulation.serve is not None
                 self.endpoints[name] = emulation.serve(replace(request, tap=WireTap(name, bus)))
+            if self._wire_log is not None:
+                self._wire_log.listen_to_buses()
         except BaseException:
             self.close()
             raise

@@ -10,7 +10,7 @@ import numpy as np
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.devices.drivers import (
     DeviceSettings,
     Emulation,
@@ -28,14 +28,15 @@ from microdrivers.rig.yaml_file import Document, raise_all, read_document, valid
 DEFAULT_WORLD = "microscope"
 REPLAY_WORLD = "wire-log"
 _DEFAULT_FILE = Path("default world")
+_OVERRIDES = "world_overrides"
 
 
 class Simulation:
     """The world and the emulators behind a rig.
 
     The world file is the one given, or `worlds/<rig file's name>` beside the rig file if it exists, or the default
-    world's defaults. With `wire_log` the world is what that wire log tells, and the log answers in place of the
-    emulators.
+    world's defaults; the figures of `world_overrides` stand in place of its own. With `wire_log` the world is what that
+    wire log tells, and the log answers in place of the emulators.
 
     Raises:
         UnsupportedError: a driver has no emulator; all such devices are named.
@@ -50,11 +51,13 @@ class Simulation:
         bus: Bus,
         seed: int,
         world_file: Path | None = None,
+        world_overrides: Mapping[str, Any] | None = None,
         wire_log: Path | None = None,
     ) -> None:
         self._description = description
         self.seed = seed
         self.world_file = world_file or _beside(description.file)
+        self._world_overrides = world_overrides or {}
         self.world = self._build_world(_replay_of(wire_log) if wire_log is not None else self._read_world(), clock, bus)
         own = self.world if isinstance(self.world, WorldWithEmulators) else None
         self.starts_anew = own.starts_anew if own is not None else True
@@ -99,7 +102,10 @@ class Simulation:
         return found
 
     def _read_world(self) -> Document:
-        return read_document(self.world_file) if self.world_file is not None else Document(_DEFAULT_FILE, {}, {})
+        document = read_document(self.world_file) if self.world_file is not None else Document(_DEFAULT_FILE, {}, {})
+        if not self._world_overrides or not isinstance(document.data, dict | None):
+            return document
+        return document._replace(data=merge_settings(document.data or {}, self._world_overrides))
 
     def _build_world(self, document: Document, clock: Clock, bus: Bus) -> World:
         name = document.data.get("world", DEFAULT_WORLD) if isinstance(document.data, dict) else DEFAULT_WORLD
@@ -107,10 +113,21 @@ class Simulation:
         if world_type is None:
             raise document.error(f"no world {name!r} is installed", ("world",), remedy=f"use {DEFAULT_WORLD!r}")
         settings, errors = validate(world_type.settings, document.data, document)
-        raise_all(document, errors)
+        raise_all(document, [self._blame_overrides(error) for error in errors])
         return world_type.build(
             WorldRequest(settings=settings, rig=self._description.as_data(), seed=self.seed, clock=clock, bus=bus)
         )
+
+    def _blame_overrides(self, error: ConfigError) -> ConfigError:
+        """The error without a place in the file if what is wrong does not stand there."""
+        value: Any = self._world_overrides
+        for part in error.key.split("."):
+            if not isinstance(value, Mapping):
+                break
+            if part not in value:
+                return error
+            value = value[part]
+        return ConfigError(error.what, remedy=error.remedy, file=_OVERRIDES, key=error.key)
 
 
 def _replay_of(wire_log: Path) -> Document:

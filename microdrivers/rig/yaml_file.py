@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args, get_origin
 
 import pydantic
 import yaml
@@ -177,11 +177,15 @@ def _translate(detail: Any, model: type[pydantic.BaseModel], document: Document,
 
 
 def _known_keys(model: type[pydantic.BaseModel], location: Sequence[str | int]) -> list[str]:
-    """The keys that the model allows at a location, followed through nested models."""
+    """The keys that the model allows at a location, followed through nested models and lists of them."""
     current: Any = model
     for part in location:
-        field = current.model_fields.get(str(part))
+        if isinstance(part, int):
+            continue
+        field = current.model_fields.get(part)
         inner = field.annotation if field is not None else None
+        if get_origin(inner) is tuple:
+            inner = get_args(inner)[0]
         if not (isinstance(inner, type) and issubclass(inner, pydantic.BaseModel)):
             return []
         current = inner

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,11 @@ def identity_text(info: DeviceInfo) -> str:
 
 
 def unreferenced_axes(device: Device[Any]) -> list[str]:
-    """The axes of a stage whose reference is not known, as the device last reported; [] for other devices."""
+    """The axes of a stage whose reference is not known, in the order to reference them; [] for other devices."""
     if not isinstance(device, Stage):
         return []
-    return [axis for axis, known in device.referenced.items() if not known]
+    known = device.referenced
+    return [axis for axis in device.reference_order if not known[axis]]
 
 
 def fault_remedy(error: MicrodriversError, file: Path, device: str) -> str:
@@ -54,7 +56,8 @@ def state_text(device: Device[Any], sample: Sample | None) -> str:
         parts.append("referenced" if sample.referenced else "NOT REFERENCED")
         parts.append(_motion_text(sample))
     elif isinstance(sample, ForceSample):
-        parts = [f"force {sample.force_uN:.3f} µN (raw {sample.raw_uN:.3f}, tare {sample.tare_uN:.3f})"]
+        force = "no valid force" if math.isnan(sample.force_uN) else f"force {sample.force_uN:.3f} µN"
+        parts = [f"{force} (raw {sample.raw_uN:.3f}, tare {sample.tare_uN:.3f})"]
     else:
         parts = [f"{key} {value}" for key, value in payload_of(sample).items()]
     if sample is not None and sample.flags:

@@ -7,27 +7,28 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from microdrivers.core.errors import LinkError, MicrodriversError, MotionError
-from microdrivers.core.samples import PoseSample, Sample, ZoomSample
+from microdrivers.core.samples import ForceSample, PoseSample, Sample, ZoomSample
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.base import Device
 from microdrivers.devices.camera import Camera
-from microdrivers.devices.force_sensor import INVALID, ForceSensor
+from microdrivers.devices.force_sensor import DISCONNECTED, INVALID, SATURATED, UNTARED
+from microdrivers.devices.shared_bus import SharesABus
 from microdrivers.devices.stage import Stage
-from microdrivers.devices.zoom_motor import ZoomMotor
+from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.rig import Rig
-from microdrivers.routines.camera_check import LEAST_RATE_SHARE, RATE_TIME_S, STAMP_LIMIT_NS, check_camera
+from microdrivers.routines.bus_check import buses_of, check_bus
+from microdrivers.routines.camera_check import STAMP_LIMIT_NS, check_camera
 from microdrivers.routines.device_state import fault_remedy, identity_text, state_text, unreferenced_axes
 from microdrivers.routines.findings import DeviceDiagnosis, Diagnosis
+from microdrivers.routines.guard_check import check_guards
 from microdrivers.routines.progress import Progress
+from microdrivers.routines.stream_check import check_stream
 
 READS = 20
 STEP_UM = 20.0
-POSE_RATE_HZ = 100.0
-"""What the optical calibration streams a stage at; `ZOOM_RATE_HZ` likewise."""
-ZOOM_RATE_HZ = 70.0
-OTHER_RATE_HZ = 50.0
 
 _MOST_FAILED_READS = 3
+_SECOND_LOOK_S = 0.6
 _SLOW_FACTOR = 10.0
 _STEP_SPEED_UM_S = 200.0
 _STEP_SLACK_UM = 0.5
@@ -48,6 +49,8 @@ class CountsItsLine(Protocol):
 
 def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None) -> Diagnosis:
     """Open every device of a closed rig by itself and examine it; one failure does not hide the others.
+
+    Then let all devices of each bus that they share stream at once, and examine the bus.
 
     Args:
         rig: built and not opened; the caller closes it.
@@ -74,12 +77,19 @@ def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None
             found.failed(error)
         if device.fault is not None:
             found.problem(f"the device is at fault: {device.fault.what}", fault_remedy(device.fault, file, name))
+    check_guards(rig, diagnoses)
+    buses = []
+    for bus, devices in buses_of(rig.devices.values()).items():
+        if progress is not None:
+            progress.step(f"examining {bus}")
+        buses.append(check_bus(bus, devices))
     return Diagnosis(
         rig=rig.file.name,
         file=str(rig.description.file),
         fake=rig.fake or rig.file.emulated,
         clock="simulated" if rig.clock.simulated else "system",
         devices=diagnoses,
+        buses=buses,
     )
 
 
@@ -90,16 +100,20 @@ def _examine(rig: Rig, device: Device[Any], found: DeviceDiagnosis, motion: bool
     last = _check_round_trip(device, found)
     if last is None:
         return
-    if motion and rig.starts_anew and isinstance(device, Stage) and unreferenced_axes(device):
-        device.reference([axis for axis in device.reference_order if axis in unreferenced_axes(device)])
+    if motion and rig.starts_anew and isinstance(device, Stage) and (unknown := unreferenced_axes(device)):
+        device.reference(unknown)
+        last = device.read()
+    if isinstance(last, ForceSample) and last.flags & INVALID:
+        device.clock.sleep(_SECOND_LOOK_S)  # a broken wire may look like a force at first
         last = device.read()
     _check_state(rig, device, last, found)
     _check_time(device, last, found)
-    _check_stream(device, found)
+    check_stream(device, found)
     if motion and isinstance(device, Stage):
         _check_motion(device, found)
     if isinstance(device, CountsItsLine):
-        _check_line(device.line_counters, found)
+        of_bus = device.bus_facts.counters if isinstance(device, SharesABus) else ()
+        _check_line({name: count for name, count in device.line_counters.items() if name not in of_bus}, found)
 
 
 def _check_round_trip(device: Device[Any], found: DeviceDiagnosis) -> Sample | None:
@@ -135,8 +149,10 @@ def _check_state(rig: Rig, device: Device[Any], sample: Sample, found: DeviceDia
     file = rig.description.file
     command = f"make sure that the way is free, then: microdrivers reference {file} --device {device.name}"
     axes = unreferenced_axes(device)
-    if isinstance(device, ForceSensor) and sample.flags & INVALID:
-        found.problem(f"{text}: no valid reading", "free the tip; check sensor, cable, range and zero in the rig file")
+    if isinstance(sample, ForceSample) and sample.flags & INVALID:
+        found.problem(text, _invalid_remedy(sample))
+    elif UNTARED in sample.flags:
+        found.ok(f"{text}: no zero is taken yet, as after every start")
     elif axes:
         found.warn(f"{text} (positions mean nothing yet)", f"{command} --axes {','.join(axes)}")
     elif isinstance(sample, ZoomSample) and not sample.referenced:
@@ -155,42 +171,22 @@ def _check_state(rig: Rig, device: Device[Any], sample: Sample, found: DeviceDia
                 )
 
 
+def _invalid_remedy(sample: ForceSample) -> str:
+    if DISCONNECTED in sample.flags:
+        return "check the sensor's plug and cable at the amplifier or module, and its supply"
+    if SATURATED in sample.flags:
+        return "free the tip; if it is free, compare range_uN and zero in the rig file with the sensor"
+    return "check cable and power"
+
+
 def _check_time(device: Device[Any], sample: Sample, found: DeviceDiagnosis) -> None:
     found.figures |= {"t_source": sample.t_source, "stated_uncertainty_ms": sample.dt_ns / NS_PER_MS}
     what = f"its time is stated to ±{sample.dt_ns / NS_PER_MS:.3g} ms ({sample.t_source})"
-    if isinstance(device, Stage):
+    if isinstance(device, XYThetaStage):
         remedy = "calibrate with --settled; a faster line or a controller on a serial port helps"
         found.judge(sample.dt_ns <= STAMP_LIMIT_NS, what, remedy)
     else:
         found.ok(what)
-
-
-def _check_stream(device: Device[Any], found: DeviceDiagnosis) -> None:
-    wanted_hz = OTHER_RATE_HZ
-    if isinstance(device, Stage):
-        wanted_hz = POSE_RATE_HZ
-    elif isinstance(device, ForceSensor):
-        wanted_hz = device.stream_rate_hz
-    elif isinstance(device, ZoomMotor):
-        wanted_hz = ZOOM_RATE_HZ
-    times_ns: list[int] = []
-    subscription = device.topic.subscribe(lambda sample: times_ns.append(sample.t_ns))
-    try:
-        with device.stream(wanted_hz):
-            device.clock.sleep(RATE_TIME_S)
-        device.clock.sleep(0.0)  # an error in a source of the clock comes to light in the next wait
-    finally:
-        subscription.cancel()
-    rate_hz = len(times_ns) / RATE_TIME_S
-    found.figures |= {"stream_asked_hz": wanted_hz, "stream_hz": rate_hz}
-    if not times_ns:
-        found.problem(f"no sample came in {RATE_TIME_S:g} s of streaming", "check cable and power")
-        return
-    found.judge(
-        rate_hz >= LEAST_RATE_SHARE * wanted_hz,
-        f"streams {rate_hz:.0f} samples/s of {wanted_hz:g} asked",
-        "raise the baud rate, give the device a line of its own, or ask for fewer samples",
-    )
 
 
 def _check_line(counters: Mapping[str, int], found: DeviceDiagnosis) -> None:

@@ -20,12 +20,10 @@ class Finding(msgspec.Struct, frozen=True):
     remedy: str = ""
 
 
-class DeviceDiagnosis(msgspec.Struct, kw_only=True):
-    """What was found of one device; `figures` holds what was measured, units in the names."""
+class Found(msgspec.Struct, kw_only=True):
+    """What was found; `figures` holds what was measured, units in the names."""
 
     name: str
-    driver: str
-    info: DeviceInfo | None = None
     findings: list[Finding] = msgspec.field(default_factory=list)
     figures: dict[str, Any] = msgspec.field(default_factory=dict)
 
@@ -53,6 +51,19 @@ class DeviceDiagnosis(msgspec.Struct, kw_only=True):
             self.warn(what, remedy)
 
 
+class DeviceDiagnosis(Found, kw_only=True):
+    """What was found of one device."""
+
+    driver: str
+    info: DeviceInfo | None = None
+
+
+class BusDiagnosis(Found, kw_only=True):
+    """What was found of a bus that these devices share."""
+
+    devices: list[str]
+
+
 class Diagnosis(msgspec.Struct, kw_only=True):
     """What was found of a whole rig."""
 
@@ -61,7 +72,8 @@ class Diagnosis(msgspec.Struct, kw_only=True):
     fake: bool
     clock: Literal["simulated", "system"]
     devices: list[DeviceDiagnosis]
+    buses: list[BusDiagnosis] = msgspec.field(default_factory=list)
 
     def count(self, level: Level) -> int:
         """Findings of a level."""
-        return sum(finding.level == level for device in self.devices for finding in device.findings)
+        return sum(finding.level == level for part in (*self.devices, *self.buses) for finding in part.findings)

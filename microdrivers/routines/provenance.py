@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from microdrivers import __version__
-from microdrivers.results.optics import Provenance
+from microdrivers.results.record import Provenance
 
 
 def describe_run(known: Mapping[str, Any], *, command: str, now: datetime.datetime) -> Provenance:

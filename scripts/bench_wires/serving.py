@@ -38,6 +38,7 @@ class Serving:
         self.rig_file = Path(self._folder.name) / "served.yaml"
         data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
         del data["microscope"]
+        data["safety"] = "none"
         data["devices"] = {name: data["devices"][name] | (changes or {}).get(name, {}) for name in devices}
         part.write_text(yaml.safe_dump(data), encoding="utf-8")
         command = [sys.executable, __file__, str(part), str(seed), str(self.rig_file)]

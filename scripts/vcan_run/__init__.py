@@ -12,4 +12,5 @@ virtual environment, in the same directory.
 | `kernel_modules` | load order of kernel modules |
 | `guest/` | the scripts that run inside the guest |
 | `uml_xsave.c` | lets User Mode Linux start on CPUs whose register state is larger than it knows |
+| `uml_clock.c` | lets its clock stand still while the host does not let it run |
 """

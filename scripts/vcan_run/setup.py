@@ -18,7 +18,7 @@ from pathlib import Path
 from .job import NotUsable
 
 QEMU = "qemu-system-x86_64"
-_SHIM_SOURCE = Path(__file__).with_name("uml_xsave.c")
+_PRELOAD_SOURCES = tuple(Path(__file__).with_name(name) for name in ("uml_xsave.c", "uml_clock.c"))
 _XZ_MAGIC = b"\xfd7zXZ\0"
 
 
@@ -35,13 +35,13 @@ class Cache:
         self.folder = Path(os.environ.get("MICRODRIVERS_VM_CACHE") or user_cache / "microdrivers" / "vm").absolute()
         self.busybox = self.folder / "busybox"
         self.uml = self.folder / "uml"
-        self.uml_shim = self.folder / "uml_xsave.so"
+        self.uml_preload = self.folder / "uml_preload.so"
         self.linux = self.folder / "linux"
 
     @property
     def has_uml(self) -> bool:
         """Whether the `uml` backend is set up."""
-        return self.uml.is_dir() and self.busybox.is_file()
+        return self.uml.is_dir() and self.uml_preload.is_file() and self.busybox.is_file()
 
     @property
     def has_qemu(self) -> bool:
@@ -50,21 +50,24 @@ class Cache:
 
 
 def set_up_uml(cache: Cache) -> None:
-    """A user-mode kernel with its modules (120 MB), and the shim that it needs on some CPUs.
+    """A user-mode kernel with its modules (120 MB), and the library that mends what it lacks.
 
     Raises:
-        NotUsable: something cannot be fetched.
+        NotUsable: something cannot be fetched, or there is no C compiler and the user is not root.
     """
-    _require_debian()
-    _set_up_busybox(cache)
-    if not cache.uml.is_dir():
-        _make(cache.uml, lambda folder: _unpack("user-mode-linux", folder))
-    if cache.uml_shim.is_file():
+    if not (cache.busybox.is_file() and cache.uml.is_dir()):
+        _require_debian()
+        _set_up_busybox(cache)
+        if not cache.uml.is_dir():
+            _make(cache.uml, lambda folder: _unpack("user-mode-linux", folder))
+    newest_s = max(source.stat().st_mtime for source in _PRELOAD_SOURCES)
+    if cache.uml_preload.is_file() and cache.uml_preload.stat().st_mtime >= newest_s:
         return
     if shutil.which("cc") is None:
-        say("no C compiler (package gcc): the uml backend will not start on CPUs with AMX")
-        return
-    _make(cache.uml_shim, lambda file: _run(["cc", "-O2", "-shared", "-fPIC", "-o", file, _SHIM_SOURCE, "-ldl"]))
+        _install("gcc", "libc6-dev")
+    _make(
+        cache.uml_preload, lambda file: _run(["cc", "-O2", "-shared", "-fPIC", "-o", file, *_PRELOAD_SOURCES, "-ldl"])
+    )
 
 
 def set_up_qemu(cache: Cache) -> None:
@@ -134,20 +137,29 @@ def _unpack(package: str, folder: Path) -> None:
                 break
             attempt()
         else:
-            raise NotUsable(f"cannot download '{package}' (run 'apt-get update' as root first?)")
+            raise NotUsable(_unreachable(f"download {package}"))
         _run(["dpkg-deb", "-x", next(Path(scratch).glob("*.deb")), folder])
 
 
-def _install(package: str) -> None:
-    command = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", package]
+def _install(*packages: str) -> None:
+    names = " ".join(packages)
+    command = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *packages]
     if os.geteuid() != 0:
-        raise NotUsable(f"QEMU is missing and only root can install it: sudo {' '.join(command)}")
-    say(f"installing {package}")
+        raise NotUsable(f"{names} is missing and only root can install it: sudo {' '.join(command)}")
+    say(f"installing {names}")
     for attempt in _attempts():
         if _succeeds(command):
             return
         attempt()
-    raise NotUsable(f"cannot install '{package}'")
+    raise NotUsable(_unreachable(f"install {names}"))
+
+
+def _unreachable(what: str) -> str:
+    lists = "" if os.geteuid() == 0 else "run 'sudo apt-get update' first; "
+    return (
+        f"apt cannot {what}, see above. It needs a package server, once: {lists}without a network, copy the folder "
+        f"{Cache().folder} from a computer where this has worked, or (for CAN) use a kernel that has vcan"
+    )
 
 
 def _attempts() -> list[Callable[[], object]]:

@@ -8,6 +8,7 @@ import pytest
 
 from microdrivers.backends.canopen.sync import SyncProducer
 from microdrivers.backends.canopen.synced_pdos import PdosMissing, SyncedPdos, SyncSet
+from microdrivers.backends.lines.can_in_process import InProcessAdapter, InProcessReceiver
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.fakes.can import Due, Frame
 from tests.backends.canopen_bench import LineBench
@@ -149,15 +150,15 @@ def test_answers_that_are_handed_over_late_belong_to_their_own_sync(monkeypatch:
     """A busy computer reads frames milliseconds after they have passed: their stamps tell where they belong."""
     monkeypatch.setattr(SyncProducer, "_await_answers", lambda producer: None)
     with SyncBench() as bench:
-        adapter = bench.line._adapter
-        assert adapter is not None
+        adapter, receiver = bench.line._adapter, bench.line._receiver
+        assert isinstance(adapter, InProcessAdapter)
+        assert isinstance(receiver, InProcessReceiver)
         running = bench.pdos.run(200.0)
         for _ in range(20):
             bench.clock.sleep(0.0437)
-            adapter.notify(None)
+            adapter._bus.on_arrival(None)
             bench.clock.sleep(0.0131)
-            adapter.notify(bench.line._drain)
-            bench.line._drain()
+            adapter.port.deliver_to(receiver._take, receiver._fail)
         running.cancel()
         assert bench.pdos.lost == bench.pdos.skipped == 0
         assert [number for found in bench.sets for number in bench.numbers(found)] == list(

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from microdrivers.backends.cia404 import Cia404ForceSettings
 from microdrivers.backends.cia404.measurement_frame import STATUS_FLAGS, frame_time
 from microdrivers.backends.cia404.physical_unit import uN_per_unit
-from microdrivers.core.errors import BusyError, OutOfRange
+from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, Range
 from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, UNTARED
 from microdrivers.fakes.can import Frame, frame_bits
@@ -252,14 +252,37 @@ def test_lost_answers_to_sync_are_counted() -> None:
         assert bench.sensor.lost_frames >= 1
 
 
-def test_one_stream_at_a_time() -> None:
+def test_a_stream_is_shared_and_the_fastest_wish_holds() -> None:
     with ForceBench().opened() as bench:
-        with bench.sensor.stream(100.0), pytest.raises(BusyError, match="probe_force: a stream is open"):  # noqa: SIM117
-            with bench.sensor.stream(100.0):
-                pass
+
+        def rate_hz() -> float:
+            bench.clock.run_for(0.02)
+            before = len(bench.samples)
+            bench.clock.run_for(0.5)
+            return 2.0 * (len(bench.samples) - before)
+
         with bench.sensor.stream(100.0):
+            assert rate_hz() == pytest.approx(100.0, abs=4)
+            with bench.sensor.stream(50.0):
+                assert rate_hz() == pytest.approx(100.0, abs=4)
+            with bench.sensor.stream(500.0):
+                assert rate_hz() == pytest.approx(500.0, abs=4)
+                with pytest.raises(OutOfRange), bench.sensor.stream(1e6):
+                    pass
+                assert rate_hz() == pytest.approx(500.0, abs=4)
+            assert bench.sensor.streaming
+        assert not bench.sensor.streaming
+        assert rate_hz() == 0.0
+
+
+def test_a_sensor_that_was_closed_streams_again_for_others() -> None:
+    with ForceBench().opened() as bench, bench.sensor.stream(100.0):
+        bench.sensor.close()
+        bench.sensor.open()
+        assert not bench.sensor.streaming
+        with bench.sensor.stream(50.0):
             bench.clock.run_for(0.1)
-        assert bench.samples
+        assert bench.samples[-1].seq > 0
 
 
 def test_a_rate_that_the_bus_or_the_amplifier_cannot_carry() -> None:

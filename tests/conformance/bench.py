@@ -180,7 +180,9 @@ def served(
     `drivers` are others, such as ones with a planted fault, by the device that they are put in front of.
     """
     data = yaml.safe_load((file or shipped_rig("microscope")).read_text(encoding="utf-8"))
-    data.pop("microscope")
+    for section in ("microscope", "probe"):
+        data.pop(section, None)
+    data["safety"] = "none"
     data["devices"] = {name: data["devices"][name] for name in devices}
     with tempfile.TemporaryDirectory() as folder:
         part, pointing = Path(folder) / "part.yaml", Path(folder) / "served.yaml"

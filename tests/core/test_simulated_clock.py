@@ -123,3 +123,82 @@ def test_a_failing_callback_reaches_the_main_program_and_leaves_the_clock_usable
 def test_a_period_must_be_positive():
     with pytest.raises(ClockError, match="positive"):
         SimulatedClock().every(0.0, lambda: None, name="camera")
+
+
+# ---------------------------------------------------------------------- emulators that work ahead
+
+
+def chain(clock, times_ns, seen, *, ahead):
+    """Something that happens at these times: in one call as far as the clock lets it, or in a call each."""
+    waiting = list(times_ns)
+
+    def step():
+        while True:
+            seen.append(("chain", clock.now_ns()))
+            if not waiting:
+                return
+            t_ns = waiting.pop(0)
+            if not (ahead and clock.go_on_at(t_ns)):
+                clock.call_at(t_ns, step)
+                return
+
+    clock.call_at(waiting.pop(0), step)
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    st.lists(st.integers(0, 50), min_size=1, max_size=12).map(sorted),
+    st.lists(st.integers(0, 50), max_size=12),
+    st.lists(st.integers(0, 25), max_size=6),
+)
+def test_going_on_is_the_same_as_being_called_again(times_ms, others_ms, sleeps_ms):
+    def run(*, ahead):
+        clock, seen = SimulatedClock(), []
+        for number, t_ms in enumerate(others_ms):
+            clock.call_at(t_ms * MS, lambda number=number: seen.append((number, clock.now_ns())))
+        chain(clock, [t_ms * MS for t_ms in times_ms], seen, ahead=ahead)
+        for pause_ms in sleeps_ms:
+            clock.sleep(pause_ms / 1000)
+            seen.append(("main", clock.now_ns()))
+        return seen
+
+    assert run(ahead=True) == run(ahead=False)
+
+
+def test_a_callback_knows_how_long_nobody_else_can_act():
+    clock, seen = SimulatedClock(), []
+    clock.call_at(MS, lambda: seen.append(clock.free_until_ns()))
+    clock.call_at(2 * MS, lambda: seen.append(clock.free_until_ns()))
+    clock.call_at(4 * MS, lambda: None).cancel()
+    clock.call_at(5 * MS, lambda: None)
+    clock.sleep(0.003)
+    assert seen == [2 * MS, 3 * MS + 1]  # the next call; the end of the main program's wait
+    assert clock.free_until_ns() == 3 * MS
+    assert not clock.go_on_at(3 * MS)
+
+
+def test_who_waits_for_an_event_may_go_on_after_any_call():
+    clock, seen = SimulatedClock(), []
+    event = clock.event()
+
+    def fire():
+        event.set()
+        seen.append((clock.free_until_ns(), clock.go_on_at(2 * MS)))
+
+    clock.call_at(MS, fire)
+    assert event.wait(1.0)
+    assert seen == [(MS, False)]
+    assert clock.now_ns() == MS
+
+
+def test_what_follows_an_exchange_comes_once_and_before_all_others():
+    clock, seen = SimulatedClock(), []
+    clock.call_at(MS, lambda: seen.append("due meanwhile"))
+    with clock.transaction():
+        with clock.transaction():
+            clock.after_exchange(lambda: seen.append(clock.now_ns() // MS))
+            clock.sleep(0.002)
+        assert seen == []
+    with clock.transaction():
+        pass
+    assert seen == [2, "due meanwhile"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import pytest
 from hypothesis import given, settings
@@ -177,6 +177,75 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     assert run_rig(1) == run_rig(1)
     assert run_rig(1) != run_rig(2)  # the host reads at other times
     assert [frame for _, frame in run_rig(1)] == [frame for _, frame in run_rig(2)]
+
+
+class StepwiseClock(SimulatedClock):
+    """Lets nobody work ahead: each event is a call of its own."""
+
+    def free_until_ns(self) -> int:
+        return self._global_ns
+
+    def go_on_at(self, t_ns: int) -> bool:
+        return False
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(st.tuples(st.integers(0, 2), st.integers(0, 2_000_000), st.integers(0, 0x7FF)), max_size=25),
+    st.lists(st.integers(0, 2_000_000), max_size=4),
+    st.integers(0, 9),
+)
+def test_working_ahead_changes_nothing(sends: list[tuple[int, int, int]], errors: list[int], seed: int) -> None:
+    """Hosts that answer what they hear, nodes with events of their own, error frames: all as in single steps."""
+
+    def run(clock: SimulatedClock) -> tuple[list[object], list[tuple[int, int, Frame]]]:
+        medium = Medium("any", clock=clock, bitrate=500_000, seed=seed)
+        ports = [medium.open_port() for _ in range(3)]
+        told: list[tuple[int, int, Frame]] = []
+        medium.attach(Periodic(0x190, period_ms=0.7))
+        medium.attach(Answering({SDO_REQUEST: SDO_REPLY}))
+
+        def hear(identifier: int, data: bytes, t_ns: int) -> None:
+            told.append((clock.now_ns(), t_ns, Frame(identifier, data)))
+            if identifier % 5 == 0:
+                ports[0].send(SDO_REQUEST)
+            if identifier % 7 == 0:
+                clock.call_at(clock.now_ns() + 10_000, lambda: ports[0].send(Frame(0x001)))
+            if identifier % 11 == 0 and not clock.in_transaction:
+                with clock.transaction():
+                    ports[0].receive_until(lambda: False, clock.now_ns() + 300_000)
+
+        ports[0].deliver_to(hear, lambda _: None)
+        ports[1].on_arrival(lambda: told.append((clock.now_ns(), -1, SYNC)))
+        for number, t_ns, identifier in sends:
+            frame = Frame(identifier, bytes(number))
+            clock.call_at(t_ns, lambda number=number, frame=frame: ports[number].send(frame))
+        for t_ns in errors:
+            clock.call_at(t_ns, medium.inject_error_frame)
+        clock.sleep(0.001)
+        told.append((clock.now_ns(), len(medium.log), SYNC))
+        clock.sleep(0.02)
+        return list(medium.log), told
+
+    assert run(SimulatedClock()) == run(StepwiseClock())
+
+
+def test_nodes_get_what_they_listen_to_and_keep_their_own_times(clock: SimulatedClock, medium: Medium) -> None:
+    class Choosy(Periodic):
+        listens_to: Container[int] = frozenset({0x100})
+
+        def receive(self, frame: Frame, t_ns: int) -> Sequence[Due]:
+            self.listens_to = frozenset({0x100, 0x200})
+            return super().receive(frame, t_ns)
+
+    node, port = Choosy(0x185, period_ms=1), medium.open_port()
+    medium.attach(node)
+    for identifier in (0x200, 0x300, 0x100, 0x200, 0x300):
+        port.send(Frame(identifier))
+        clock.sleep(0.0005)
+    clock.sleep(0.01)
+    assert [frame.id for _, frame in node.heard] == [0x100, 0x200]
+    assert node.advanced == [START_NS + n * NS_PER_MS for n in range(13)]
 
 
 def test_a_frame_can_be_read_soon_after_it_has_arrived(clock: SimulatedClock) -> None:

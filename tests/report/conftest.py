@@ -12,7 +12,6 @@ import pytest
 from microdrivers.estimators.optics import optical_parameters
 from microdrivers.results.optics import (
     OpticsResult,
-    Provenance,
     Tilt,
     Traces,
     Truth,
@@ -20,6 +19,7 @@ from microdrivers.results.optics import (
     ZoomChange,
     iterations_to_settle,
 )
+from microdrivers.results.record import Provenance
 
 MakeResult = Callable[..., OpticsResult]
 PITCH_UM = 7.4

@@ -3,14 +3,13 @@ import pytest
 
 from microdrivers.estimators.optics import optical_parameters, student_factor
 from microdrivers.report.optics_quantities import (
-    created,
     key_quantities,
     projection_quantities,
-    run_kind,
     settled_error,
     settled_index,
     settling,
 )
+from microdrivers.report.page import created, run_kind
 
 
 def by_name(result):
@@ -135,7 +134,10 @@ def test_settled_frames(make_result):
      (False, "system", "real"), (True, "system", "simulated")],
 )  # fmt: skip
 def test_run_kind(make_result, fake, clock, key):
-    assert run_kind(make_result(frames=10, zoom_change=False, provenance={"fake": fake, "clock": clock})).key == key
+    assert (
+        run_kind(make_result(frames=10, zoom_change=False, provenance={"fake": fake, "clock": clock}).provenance).key
+        == key
+    )
 
 
 @pytest.mark.parametrize(
@@ -144,4 +146,4 @@ def test_run_kind(make_result, fake, clock, key):
      ("2025-03-04T09:15:42", "2025-03-04 09:15 UTC"), ("yesterday", "yesterday")],
 )  # fmt: skip
 def test_created(make_result, text, shown):
-    assert created(make_result(frames=10, zoom_change=False, provenance={"created_utc": text})) == shown
+    assert created(make_result(frames=10, zoom_change=False, provenance={"created_utc": text}).provenance) == shown

@@ -11,8 +11,9 @@ from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.errors import LinkTimeout
 from microdrivers.fakes.wire import wire_named
 from microdrivers.rig import build_rig
-from microdrivers.routines.doctor import POSE_RATE_HZ, ZOOM_RATE_HZ, diagnose
+from microdrivers.routines.doctor import diagnose
 from microdrivers.routines.optics import CircleSettings
+from microdrivers.routines.stream_check import POSE_RATE_HZ, ZOOM_RATE_HZ
 
 
 @pytest.fixture

@@ -4,14 +4,15 @@ import pytest
 
 from tests.conformance.fine_stage_suite import SUITE
 from tests.conformance.tool_bench import bring_home, served_fine_stage_bench
+from tests.vcan.quick_rig import quick_rig
 
 pytestmark = pytest.mark.vcan
 
 
 @pytest.fixture(scope="module")
-def stage_on_vcan():
+def stage_on_vcan(tmp_path_factory):
     """One served stage for all checks: to reference it takes seconds of real time."""
-    with served_fine_stage_bench(can_interface="vcan0") as bench:
+    with served_fine_stage_bench(can_interface="vcan0", file=quick_rig(tmp_path_factory.mktemp("rig"))) as bench:
         yield bench
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import heapq
 import itertools
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from types import TracebackType
 
 from microdrivers.core.clock.base import Clock, ClockError, ClockEvent, Timer
 from microdrivers.core.clock.interruption import INTERRUPTION
@@ -28,7 +29,10 @@ class SimulatedClock(Clock):
         self._global_ns = start_ns
         self._local_ns: int | None = None
         self._in_callback = False
+        self._free_ns = start_ns
         self._transactions = 0
+        self._transaction = _Transaction(self)
+        self._after_exchange: list[Callable[[], object]] = []
         self._queue: list[tuple[int, int, _Call]] = []
         self._numbers = itertools.count()
         self._thread = threading.get_ident()
@@ -37,16 +41,17 @@ class SimulatedClock(Clock):
         return self._global_ns if self._local_ns is None else self._local_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        self._check_thread()
         if self._transactions:
-            self._local_ns = max(self.now_ns(), t_ns)
-        elif self._in_callback:
+            if self._local_ns is None or t_ns > self._local_ns:
+                self._local_ns = t_ns
+            return
+        self._check_thread()
+        if self._in_callback:
             raise ClockError(
                 "a clock callback must not wait",
                 remedy="exchange inside clock.transaction(), or schedule the rest with clock.call_at()",
             )
-        else:
-            self._dispatch_until(t_ns)
+        self._dispatch_until(t_ns)
 
     def call_at(self, t_ns: int, call: Callable[[], object], *, name: str = "") -> Timer:
         pending = _Call(call, name)
@@ -66,8 +71,8 @@ class SimulatedClock(Clock):
         def run() -> None:
             nonlocal due_ns
             call()
-            late = max(0, self.now_ns() - due_ns)
-            due_ns += period_ns * max(1, -(-late // period_ns))
+            late = self.now_ns() - due_ns
+            due_ns += period_ns if late <= 0 else period_ns * -(-late // period_ns)
             if not beat.cancelled:
                 self._push(due_ns, beat)
 
@@ -81,19 +86,8 @@ class SimulatedClock(Clock):
         else:
             self.call_at(self._local_ns, call)
 
-    @contextmanager
-    def transaction(self) -> Iterator[None]:
-        self._check_thread()
-        if self._local_ns is None:
-            self._local_ns = self._global_ns
-        self._transactions += 1
-        try:
-            yield
-        finally:
-            self._transactions -= 1
-            if not self._transactions and not self._in_callback:
-                end_ns, self._local_ns = self._local_ns, None
-                self._dispatch_until(end_ns)
+    def transaction(self) -> AbstractContextManager[None]:
+        return self._transaction
 
     @property
     def in_transaction(self) -> bool:
@@ -105,31 +99,66 @@ class SimulatedClock(Clock):
     def close(self) -> None:
         self._queue.clear()
 
+    # ------------------------------------------------------------------ for emulators
+
+    def after_exchange(self, call: Callable[[], object]) -> None:
+        """In a transaction: call when the outermost one ends, before anything else happens."""
+        self._after_exchange.append(call)
+
+    def free_until_ns(self) -> int:
+        """Before which instant nothing else can happen, as seen from a callback; the present if that is not known.
+
+        Until then an emulator may work off what falls due in itself at once: nobody can look at it, or ask it for
+        anything, before.
+        """
+        queue, free_ns = self._queue, self._free_ns
+        while queue and queue[0][2].cancelled:
+            heapq.heappop(queue)
+        if queue and queue[0][0] < free_ns:
+            free_ns = queue[0][0]
+        return free_ns if self._in_callback and free_ns > self._global_ns else self._global_ns
+
+    def go_on_at(self, t_ns: int) -> bool:
+        """Inside a callback: let the present be `t_ns` if nothing else happens before; tells whether it does so.
+
+        It is then as if the callback had ended and what follows had been asked for with `call_at`, without the detour.
+        """
+        queue = self._queue
+        if t_ns >= self._free_ns or (queue and queue[0][0] <= t_ns) or not self._in_callback or INTERRUPTION.requested:
+            return False
+        self._global_ns = self._local_ns = max(self._global_ns, t_ns)
+        return True
+
     def wait_for(self, reached: Callable[[], bool], deadline_ns: int) -> None:
         """Dispatch until `reached()` or `deadline_ns`, the main program's only other way to wait."""
         self._check_thread()
         if self._in_callback or self._transactions:
             raise ClockError("a clock callback must not wait", remedy="schedule the rest with clock.call_at()")
+        self._free_ns = self._global_ns  # whoever waits may go on after any call
         while not reached() and self._queue and self._queue[0][0] <= deadline_ns:
             self._dispatch_next()
         if not reached():
             self._global_ns = max(self._global_ns, deadline_ns)
 
     def _push(self, t_ns: int, call: _Call) -> None:
-        heapq.heappush(self._queue, (max(t_ns, self._global_ns), next(self._numbers), call))
+        due_ns = t_ns if t_ns > self._global_ns else self._global_ns
+        heapq.heappush(self._queue, (due_ns, next(self._numbers), call))
 
     def _dispatch_until(self, t_ns: int) -> None:
         INTERRUPTION.check()
-        while self._queue and self._queue[0][0] <= t_ns:
+        queue, self._free_ns = self._queue, t_ns + 1
+        while queue and queue[0][0] <= t_ns:
             self._dispatch_next()
         self._global_ns = max(self._global_ns, t_ns)
 
     def _dispatch_next(self) -> None:
-        INTERRUPTION.check()
+        if INTERRUPTION.requested:
+            INTERRUPTION.check()
         due_ns, _, pending = heapq.heappop(self._queue)
         if pending.cancelled:
             return
-        self._global_ns = max(self._global_ns, due_ns)
+        if due_ns > self._global_ns:
+            self._global_ns = due_ns
         self._in_callback, self._local_ns = True, due_ns
         try:
             pending.call()
@@ -142,6 +171,35 @@ class SimulatedClock(Clock):
                 "a simulated clock belongs to the thread that made it",
                 remedy="use SystemClock in programs with threads of their own",
             )
+
+
+class _Transaction:
+    """A clock's exchanges, which may be nested: one object will do for all."""
+
+    __slots__ = ("_clock",)
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self._clock = clock
+
+    def __enter__(self) -> None:
+        clock = self._clock
+        clock._check_thread()
+        if clock._local_ns is None:
+            clock._local_ns = clock._global_ns
+        clock._transactions += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        clock = self._clock
+        clock._transactions -= 1
+        if clock._transactions:
+            return
+        while clock._after_exchange:
+            clock._after_exchange.pop()()
+        if not clock._in_callback and clock._local_ns is not None:
+            end_ns, clock._local_ns = clock._local_ns, None
+            clock._dispatch_until(end_ns)
 
 
 class _Call:

@@ -14,15 +14,14 @@ from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.optics.calibrator import CalibratorSettings, OpticsCalibrator, PointTracker
 from microdrivers.results.optics import (
     OpticsResult,
-    Provenance,
     Tilt,
-    Trace,
     Traces,
     Truth,
     ValidFor,
     ZoomChange,
     iterations_to_settle,
 )
+from microdrivers.results.record import Provenance, Trace
 from microdrivers.routines.optics.choice import Choice, begins_change, choose_estimate
 from microdrivers.routines.optics.source import Optics, OpticsSource
 from microdrivers.routines.progress import Progress, SilentProgress

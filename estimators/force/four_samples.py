@@ -1,0 +1,340 @@
+"""Recursive ridge least squares with forgetting over the newest four samples (Bilen et al., eqs. (22)–(25)).
+
+Three columns, or four with the mass, make a small symmetric matrix. Its triangle is kept as plain scalars, which can
+neither lose its symmetry nor, at this size, be beaten by array code. The mass is eliminated first: what is left is the
+same three columns x³, x and v with and without it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from microdrivers.core.errors import DataError
+
+Array = npt.NDArray[np.float64]
+
+STACK = 4
+"""Samples that one update stacks (eq. (23))."""
+
+DETERMINED_RIDGES = 100.0
+"""A direction of θ counts as measured when the data weigh this many times more in it than the ridge."""
+
+_ROUNDING = 1e-12
+_SMALLEST_RESIDUAL_SHARE = 1e-6
+
+# φ φᵀ for φ = (x³, x, v) as cc cx cv xx xv vv; with a mass ca xa va aa; then φ F as fc fx fv, and fa; last F².
+_Row = tuple[float, ...]
+_Six = tuple[float, float, float, float, float, float]
+_Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+class Scales(NamedTuple):
+    """What the columns of eq. (22) are divided by before the ridge: state them with a result."""
+
+    x_um: float = 100.0
+    v_um_s: float = 5.0
+    a_um_s2: float = 50.0
+
+
+class Spread(NamedTuple):
+    """How well the samples so far tell θ.
+
+    Attributes:
+        condition: condition number of the scaled regressor φ: the root of R's in the Frobenius norm, which is at most
+            √3 times that in the 2-norm (2 times with a mass); infinite before the first sample.
+        determined: the samples alone fix θ: the ridge pulls any combination of it by less than 1 %.
+        covariance: of (k1, k2, b), row-major, in µN, µm and s; empty while not known.
+        noise_uN: standard deviation of the residuals that it rests on; NaN while not known.
+    """
+
+    condition: float
+    determined: bool
+    covariance: tuple[float, ...]
+    noise_uN: float
+
+
+UNDETERMINED = Spread(math.inf, False, (), math.nan)
+
+
+class FourSampleRecursion:
+    """Estimates `F = k2 x³ + k1 x + b v (+ m a)` on line; an update stacks the newest four samples (eq. (23)).
+
+    It carries `R ← λ R + φ φᵀ + δ I` and `f ← λ f + φ F` from R = 0 and f = 0, and solves eq. (25), `θ = R⁻¹ f`, at
+    every update by LDLᵀ. Columns are divided by fixed scales. Before four samples exist, the stack holds those that
+    do. Each sample is thus counted up to four times, and its weight decays: the covariance is the sandwich
+    `σ² R⁻¹ (Σ w² φ φᵀ) R⁻¹`, with w the total weight of each sample and σ from the weighted residuals.
+
+    Args:
+        scales: of the columns.
+        ridge: δ of eq. (24), on scaled columns, > 0.
+        with_mass: estimate m too; without it, the acceleration is not looked at.
+
+    Raises:
+        ValueError: a scale or the ridge is not positive and finite.
+    """
+
+    def __init__(self, *, scales: Scales | None = None, ridge: float = 1e-9, with_mass: bool = False) -> None:
+        self.scales = scales or Scales()
+        if not all(math.isfinite(value) and value > 0.0 for value in (ridge, *self.scales)):
+            raise ValueError(f"ridge {ridge} and scales {self.scales} must be positive and finite")
+        self.ridge = ridge
+        self.with_mass = with_mass
+        self.samples_used = 0
+        self._no_row: _Row = (0.0,) * (15 if with_mass else 10)
+        self._ridges: _Row = tuple(
+            ridge if k in (0, 3, 5) or (with_mass and k == 9) else 0.0 for k in range(len(self._no_row))
+        )
+        self._normal: Sequence[float] = self._no_row
+        self._squared: Sequence[float] = self._no_row[: 10 if with_mass else 6]
+        self._weight_sum = 0.0
+        self._ridge_sum = 0.0
+        self._theta = (0.0, 0.0, 0.0, 0.0)
+        self._inverse: _Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._spread: Spread | None = UNDETERMINED
+        self.restart_stack()
+
+    def restart_stack(self) -> None:
+        """Let no later stack hold an earlier sample, as at a change of branch; what was summed up stays."""
+        self._stack = (self._no_row, self._no_row, self._no_row)
+        self._weights = (0.0, 0.0, 0.0)
+        self._in_stack = 0
+
+    def update(self, *, x_um: float, v_um_s: float, force_uN: float, forgetting: float, a_um_s2: float = 0.0) -> None:
+        """Take one sample: compression, its velocity and acceleration, and the force.
+
+        Args:
+            x_um: compression from the undeformed surface.
+            v_um_s: its rate.
+            force_uN: measured force.
+            forgetting: λ in [0, 1]; 1 keeps all of the past, 0 only the stack.
+            a_um_s2: the rate of `v_um_s`.
+
+        Raises:
+            ValueError: `forgetting` is outside [0, 1].
+            DataError: a number is not finite, or too large to be squared. The estimate is then unchanged.
+        """
+        if not 0.0 <= forgetting <= 1.0:
+            raise ValueError(f"forgetting is {forgetting}: it must lie in [0, 1]")
+        x_scale, v_scale, a_scale = self.scales
+        x = x_um / x_scale
+        c = x * x * x
+        v = v_um_s / v_scale
+        a = a_um_s2 / a_scale if self.with_mass else 0.0
+        y = force_uN
+        if not math.isfinite(c * c + v * v + a * a + y * y):
+            raise DataError(
+                f"a sample is not finite: {x_um} µm, {v_um_s} µm/s, {a_um_s2} µm/s², {force_uN} µN",
+                remedy="leave out samples in which the contact point was lost or the sensor gave no force",
+            )
+        row: _Row = (c * c, c * x, c * v, x * x, x * v, v * v)
+        if self.with_mass:
+            row += (c * a, x * a, v * a, a * a, c * y, x * y, v * y, a * y, y * y)
+        else:
+            row += (c * y, x * y, v * y, y * y)
+        self._accumulate(row, forgetting)
+        self._solve()
+        self._spread = None
+        self.samples_used += 1
+
+    def _accumulate(self, row: _Row, k: float) -> None:
+        """R, f and Σ w F² with λ = `k`, and the weights of the samples."""
+        one, two, three = self._stack
+        self._normal = [
+            k * old + (a + b + c + e + d)
+            for old, a, b, c, e, d in zip(self._normal, row, one, two, three, self._ridges, strict=True)
+        ]
+        self._ridge_sum = k * self._ridge_sum + self.ridge
+        # A weight that goes from k·w to k·w + 1 adds 2·k·w + 1 to its square.
+        w1, w2, w3 = self._weights
+        g1, g2, g3 = 2.0 * k * w1 + 1.0, 2.0 * k * w2 + 1.0, 2.0 * k * w3 + 1.0
+        kk = k * k
+        self._squared = [
+            kk * old + (a + g1 * b + g2 * c + g3 * e)
+            for old, a, b, c, e in zip(self._squared, row, one, two, three, strict=False)
+        ]
+        self._in_stack = min(self._in_stack + 1, STACK)
+        self._weight_sum = k * self._weight_sum + self._in_stack
+        self._stack = (row, one, two)
+        self._weights = (1.0, k * w1 + 1.0, k * w2 + 1.0)
+
+    def _solve(self) -> None:
+        """Eq. (25) by LDLᵀ, the velocity eliminated first, and the inverse of R's block of x³, x, v."""
+        cc, cx, cv, xx, xv, vv, fc, fx, fv = self._reduced() if self.with_mass else self._normal[:9]
+        # R ≥ (accumulated ridge)·I, so no exact pivot is smaller; only rounding can make one so.
+        least = self._ridge_sum
+        if vv < least:
+            vv = least
+        l2, l3 = xv / vv, cv / vv
+        pivot2 = xx - l2 * xv
+        if pivot2 < least:
+            pivot2 = least
+        cross = cx - l3 * xv
+        l1 = cross / pivot2
+        pivot1 = cc - l3 * cv - l1 * cross
+        if pivot1 < least:
+            pivot1 = least
+        z2 = fx - l2 * fv
+        c = (fc - l3 * fv - l1 * z2) / pivot1
+        x = z2 / pivot2 - l1 * c
+        v = fv / vv - l2 * x - l3 * c
+        self._theta = (c, x, v, self._mass(c, x, v) if self.with_mass else 0.0)
+        i_cc = 1.0 / pivot1
+        i_cx = -l1 * i_cc
+        i_cv = -l3 * i_cc - l2 * i_cx
+        i_xx = 1.0 / pivot2 - l1 * i_cx
+        i_xv = -l3 * i_cx - l2 * i_xx
+        self._inverse = (i_cc, i_cx, i_cv, i_xx, i_xv, 1.0 / vv - l3 * i_cv - l2 * i_xv)
+
+    def _reduced(self) -> _Nine:
+        """The normal equations with the mass eliminated."""
+        cc, cx, cv, xx, xv, vv, ca, xa, va, aa, fc, fx, fv, fa, _ = self._normal
+        c, x, v = ca / aa, xa / aa, va / aa
+        return (
+            cc - c * ca, cx - c * xa, cv - c * va, xx - x * xa, xv - x * va, vv - v * va,
+            fc - c * fa, fx - x * fa, fv - v * fa,
+        )  # fmt: skip
+
+    def _mass(self, c: float, x: float, v: float) -> float:
+        """θ of the acceleration, given the others."""
+        ca, xa, va, aa = self._normal[6:10]
+        return (self._normal[13] - c * ca - x * xa - v * va) / aa
+
+    # ------------------------------------------------------------------ reading
+
+    @property
+    def theta(self) -> tuple[float, float, float, float]:
+        """θ of the scaled columns x³, x, v, a, µN; the last is 0 without a mass."""
+        return self._theta
+
+    @property
+    def parameters(self) -> tuple[float, float, float, float]:
+        """(k1 µN/µm, k2 µN/µm³, b µN·s/µm, m kg); m is NaN where it is not estimated."""
+        k2, k1, b, m = self._theta
+        x, v, a = self.scales
+        return (k1 / x, k2 / (x * x * x), b / v, m / a if self.with_mass else math.nan)
+
+    def predict_uN(self, *, x_um: float, v_um_s: float, a_um_s2: float = 0.0) -> float:
+        """The force of eq. (22) by the present estimate; called before `update`, the a-priori prediction."""
+        k2, k1, b, m = self._theta
+        x_scale, v_scale, a_scale = self.scales
+        x = x_um / x_scale
+        return (k1 + k2 * x * x) * x + b * v_um_s / v_scale + m * a_um_s2 / a_scale
+
+    @property
+    def information(self) -> Array:
+        """R of the scaled columns, ridge included: 3 × 3 for x³, x, v, or 4 × 4 with a."""
+        cc, cx, cv, xx, xv, vv = self._normal[:6]
+        if not self.with_mass:
+            return np.array([[cc, cx, cv], [cx, xx, xv], [cv, xv, vv]])
+        ca, xa, va, aa = self._normal[6:10]
+        return np.array([[cc, cx, cv, ca], [cx, xx, xv, xa], [cv, xv, vv, va], [ca, xa, va, aa]])
+
+    def spread(self) -> Spread:
+        """How well the samples tell θ; computed when asked for, once an update."""
+        if self._spread is None:
+            self._spread = self._computed_spread()
+        return self._spread
+
+    def _computed_spread(self) -> Spread:
+        if self.with_mass:
+            squared: Sequence[float]
+            squared, of_mass = _without(self._normal, self._squared)
+            largest = math.hypot(_norm(self._normal), math.sqrt(2.0) * math.hypot(*self._normal[6:9]), self._normal[9])
+            weakest = 1.0 / _norm_with_mass(self._inverse, self._normal)
+        else:
+            squared, of_mass = self._squared, 0.0
+            largest, weakest = _norm(self._normal), 1.0 / _norm(self._inverse)
+        condition = math.sqrt(largest / weakest)
+        enough = self.samples_used >= (4 if self.with_mass else 3)
+        if not enough or weakest < max(DETERMINED_RIDGES * self._ridge_sum, _ROUNDING * largest):
+            return Spread(condition, False, (), math.nan)
+        variance = self._noise_variance(squared, of_mass)
+        if variance is None:
+            return Spread(condition, True, (), math.nan)
+        return Spread(condition, True, self._sandwich(squared, variance), math.sqrt(variance))
+
+    def _noise_variance(self, squared: Sequence[float], of_mass: float) -> float | None:
+        """Variance of one sample's residual; None where the residuals leave nothing to judge it by."""
+        k2, k1, b, m = self._theta
+        normal = self._normal
+        if self.with_mass:
+            fc, fx, fv, fa, ff = normal[10:]
+        else:
+            fc, fx, fv, ff = normal[6:]
+            fa = 0.0
+        fitted = k2 * fc + k1 * fx + b * fv + m * fa
+        residual = ff - fitted - self._ridge_sum * (k2 * k2 + k1 * k1 + b * b + m * m)
+        cc, cx, cv, xx, xv, vv = self._inverse
+        s_cc, s_cx, s_cv, s_xx, s_xv, s_vv = squared
+        lost = cc * s_cc + xx * s_xx + vv * s_vv + 2.0 * (cx * s_cx + cv * s_cv + xv * s_xv) + of_mass
+        freedom = self._weight_sum - lost
+        if freedom <= _SMALLEST_RESIDUAL_SHARE * self._weight_sum:
+            return None
+        return max(residual, 0.0) / freedom
+
+    def _sandwich(self, squared: Sequence[float], variance: float) -> tuple[float, ...]:
+        """σ² R⁻¹ (Σ w² φ φᵀ) R⁻¹ of (k1, k2, b), row-major 3 × 3, in µN, µm and s."""
+        cc, cx, cv, xx, xv, vv = self._inverse
+        s_cc, s_cx, s_cv, s_xx, s_xv, s_vv = squared
+        cc2, cx2, cv2 = (
+            cc * s_cc + cx * s_cx + cv * s_cv,
+            cc * s_cx + cx * s_xx + cv * s_xv,
+            cc * s_cv + cx * s_xv + cv * s_vv,
+        )
+        xc2, xx2, xv2 = (
+            cx * s_cc + xx * s_cx + xv * s_cv,
+            cx * s_cx + xx * s_xx + xv * s_xv,
+            cx * s_cv + xx * s_xv + xv * s_vv,
+        )
+        vc2, vx2, vv2 = (
+            cv * s_cc + xv * s_cx + vv * s_cv,
+            cv * s_cx + xv * s_xx + vv * s_xv,
+            cv * s_cv + xv * s_xv + vv * s_vv,
+        )
+        x_scale, v_scale, _ = self.scales
+        k, h, b = 1.0 / x_scale, 1.0 / (x_scale * x_scale * x_scale), 1.0 / v_scale
+        kh = variance * k * h * (xc2 * cc + xx2 * cx + xv2 * cv)
+        kb = variance * k * b * (xc2 * cv + xx2 * xv + xv2 * vv)
+        hb = variance * h * b * (cc2 * cv + cx2 * xv + cv2 * vv)
+        return (
+            variance * k * k * (xc2 * cx + xx2 * xx + xv2 * xv), kh, kb,
+            kh, variance * h * h * (cc2 * cc + cx2 * cx + cv2 * cv), hb,
+            kb, hb, variance * b * b * (vc2 * cv + vx2 * xv + vv2 * vv),
+        )  # fmt: skip
+
+
+def _norm(triangle: Sequence[float]) -> float:
+    """Frobenius norm of a symmetric 3 × 3 matrix."""
+    cc, cx, cv, xx, xv, vv = triangle[:6]
+    return math.sqrt(cc * cc + xx * xx + vv * vv + 2.0 * (cx * cx + cv * cv + xv * xv))
+
+
+def _norm_with_mass(inverse: _Six, normal: Sequence[float]) -> float:
+    """Frobenius norm of the inverse of R, from the inverse's block without the mass."""
+    cc, cx, cv, xx, xv, vv = inverse
+    ca, xa, va, aa = normal[6:10]
+    c, x, v = ca / aa, xa / aa, va / aa
+    i_ca, i_xa, i_va = cc * c + cx * x + cv * v, cx * c + xx * x + xv * v, cv * c + xv * x + vv * v
+    i_aa = 1.0 / aa + c * i_ca + x * i_xa + v * i_va
+    return math.hypot(_norm(inverse), math.sqrt(2.0) * math.hypot(i_ca, i_xa, i_va), i_aa)
+
+
+def _without(normal: Sequence[float], squared: Sequence[float]) -> tuple[_Six, float]:
+    """Σ w² φ φᵀ of the columns from which the mass's has been taken out as in R, and the mass's part in tr(R⁻¹ S)."""
+    ca, xa, va, aa = normal[6:10]
+    c, x, v = ca / aa, xa / aa, va / aa
+    s_cc, s_cx, s_cv, s_xx, s_xv, s_vv, s_ca, s_xa, s_va, s_aa = squared
+    reduced = (
+        s_cc - 2.0 * c * s_ca + c * c * s_aa,
+        s_cx - c * s_xa - x * s_ca + c * x * s_aa,
+        s_cv - c * s_va - v * s_ca + c * v * s_aa,
+        s_xx - 2.0 * x * s_xa + x * x * s_aa,
+        s_xv - x * s_va - v * s_xa + x * v * s_aa,
+        s_vv - 2.0 * v * s_va + v * v * s_aa,
+    )
+    return reduced, s_aa / aa

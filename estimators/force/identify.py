@@ -1,0 +1,264 @@
+"""A specimen identified from one indentation, Bilen et al., sections II.B and III.C."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from microdrivers.estimators.force.branches import Branches
+from microdrivers.estimators.force.fit_motion import motion_everywhere
+from microdrivers.estimators.force.joint import BASE, MASS, Motion, force_of, slopes_of
+from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.prepared import LOADING, Indices, Prepared, SeenBefore
+from microdrivers.estimators.force.protocol_fit import (
+    ProtocolFit,
+    mass_of,
+    named_parameters,
+    parameter_covariance,
+    weak_parameters,
+)
+from microdrivers.estimators.force.protocols import Fit, ProtocolName
+from microdrivers.estimators.force.record import IndentationRecord, check
+from microdrivers.estimators.force.ridge import ridge_fit
+from microdrivers.estimators.force.selection import all_protocols, settled
+from microdrivers.estimators.force.structure import StructureTest, structure_test
+
+_SIMPLER = 1.1
+"""Of the smallest error: what a protocol with fewer parameters may have and still be preferred."""
+
+
+class IdentificationSettings(NamedTuple):
+    """How to identify.
+
+    Attributes:
+        around_reversal: samples left out on either side of contact, reversals and release.
+    """
+
+    around_reversal: int = 2
+
+
+class Contact(NamedTuple):
+    """Where and when the tool met the specimen, as the best protocol has it.
+
+    Attributes:
+        contact_um: where the undeformed surface lies in the deformation's own coordinate; sigma_um: its standard
+            deviation. contact_time_s, sigma_time_s: when it was touched; 0 s deviation if the record begins in contact.
+        seen: what the deformation followed before: the surface, the tool's tip, or nothing.
+    """
+
+    contact_um: float
+    contact_time_s: float
+    sigma_um: float
+    sigma_time_s: float
+    seen: SeenBefore
+
+
+class Slip(NamedTuple):
+    """Eq. (26), `x* = x − offset·(1 − e^(−α t))`, as `slip_corrected` has it.
+
+    Attributes:
+        offset_um, rate_per_s: offset and α, each followed by its standard deviation.
+        not_returned_um: deformation that was left when contact was lost; None if it was not lost.
+        identifiable: the record determines offset and α, and no other protocol explains it as well.
+    """
+
+    offset_um: float
+    sigma_offset_um: float
+    rate_per_s: float
+    sigma_rate_per_s: float
+    not_returned_um: float | None
+    identifiable: bool
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What one indentation says about a specimen.
+
+    Attributes:
+        protocols: by name; those that the record allows: without an unloading only `loading`.
+        best: name of the one that explains both branches best, the simpler one where that makes no difference.
+        contact: where and when.
+        slip: None without an unloading.
+        branches: index ranges of the record, and instants of its reversals.
+        excluded_samples: reason → indices of the samples that no fit uses.
+        misfit: test of the best protocol's residual structure.
+        contact_duration_s: from contact to its loss or the end of the record.
+        deformation_sigma_um, force_sigma_uN: noise used: as stated or, if clearly more was observed, as observed.
+        knots_s: spacing of the knots of the splines that the best protocol's trajectory follows; 0 for ramps.
+        notes: what else should be known, in sentences.
+    """
+
+    protocols: Mapping[ProtocolName, ProtocolFit]
+    best: ProtocolName
+    contact: Contact
+    slip: Slip | None
+    branches: Branches
+    excluded_samples: Mapping[str, Indices]
+    misfit: StructureTest
+    contact_duration_s: float
+    deformation_sigma_um: float
+    force_sigma_uN: float
+    knots_s: float
+    notes: tuple[str, ...]
+
+
+def identify(record: IndentationRecord, settings: IdentificationSettings | None = None) -> Identification:
+    """Identify a specimen from one indentation, with all protocols that the record allows.
+
+    Args:
+        record: approach, loading, hold if any, unloading; may begin in contact or end there.
+        settings: how; the usual if None.
+
+    Raises:
+        DataError: the record cannot be used; see `record.check`. NoContact: it shows no contact.
+    """
+    settings = settings or IdentificationSettings()
+    check(record)
+    prepared, on_ramps = settled(record, settings.around_reversal)
+    fits = all_protocols(prepared, on_ramps)
+    protocols = {name: _protocol_fit(prepared, name, fit) for name, fit in fits.items()}
+    best = _best(protocols)
+    chosen = protocols[best]
+    end_s = prepared.branches.release_s or float(prepared.time_s[-1])
+    return Identification(
+        protocols=protocols,
+        best=best,
+        contact=Contact(
+            chosen.contact_um,
+            chosen.contact_time_s,
+            chosen.sigma_contact_um,
+            chosen.sigma_contact_time_s,
+            prepared.contact.seen,
+        ),
+        slip=_slip(prepared, protocols.get("slip_corrected"), best == "slip_corrected"),
+        branches=prepared.branches,
+        excluded_samples=prepared.excluded,
+        misfit=chosen.misfit,
+        contact_duration_s=end_s - chosen.contact_time_s,
+        deformation_sigma_um=prepared.deformation_sigma_um,
+        force_sigma_uN=prepared.force_sigma_uN,
+        knots_s=fits[best].spacing_s,
+        notes=tuple(_notes(record, prepared)),
+    )
+
+
+def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolFit:
+    motion = motion_everywhere(prepared, fit)
+    mass = bool(fit.theta[MASS])
+    force, fitted = prepared.force_uN[prepared.used], force_of(fit.theta, motion)
+    by_x, _ = slopes_of(fit.theta, motion)
+    noise = np.hypot(by_x * prepared.deformation_sigma_um, prepared.force_sigma_uN)
+    left = force - fitted
+    loading = prepared.branch == LOADING
+    judged = loading if name == "loading" else np.ones_like(loading)
+    slips = name == "slip_corrected"
+    solution = fit.solution
+    misfit = structure_test(
+        (solution.deformation_residual, solution.force_residual), prepared.used[fit.at], left[judged], noise[judged]
+    )
+    weak = weak_parameters(
+        prepared,
+        fit.theta,
+        fit.covariance,
+        Motion(*(part[judged] for part in motion)),
+        slips=slips,
+        mass=mass,
+        structured_uN=misfit.structured_uN if misfit.found else 0.0,
+    )
+    names = ["k1", "k2", "b", "m", *(["slip", "slip_rate"] if slips else [])]
+    return ProtocolFit(
+        name=name,
+        m_kg=mass_of(fit.theta, mass),
+        covariance=parameter_covariance(fit.covariance),
+        error_percent=_percent(left[judged], force[judged]),
+        error_percent_loading=_percent(left[loading], force[loading]),
+        noise_residual_ratio=float(np.sqrt(np.mean(left[judged] ** 2) / np.mean(noise[judged] ** 2))),
+        condition_number=_condition(motion, fit.at),
+        identifiable={key: key not in weak for key in names},
+        weak=weak,
+        force_uN=_at_all_samples(prepared, fit, motion),
+        residual_uN=float(np.hypot(prepared.force_sigma_uN, fit.discrepancy_uN)),
+        within_noise=fit.within_noise,
+        misfit=misfit,
+        deepest_um=float(np.max(motion.compression_um)),
+        fastest_um_s=float(np.max(np.abs(motion.velocity_um_s))),
+        likelihood_cost=solution.cost + fit.parameters * float(np.log(2 * solution.samples)),
+        **named_parameters(fit.theta, fit.covariance),
+    )
+
+
+def _percent(left: Array, force: Array) -> float:
+    return float(100.0 * np.sqrt(np.mean(left**2) / np.mean(force**2)))
+
+
+def _condition(motion: Motion, at: Indices) -> float:
+    """Of the regressor of eq. (22), columns scaled."""
+    x, v = motion.compression_um[at], motion.velocity_um_s[at]
+    return ridge_fit(np.column_stack([v, x, x**3]), np.zeros(len(x))).condition_number
+
+
+def _at_all_samples(prepared: Prepared, fit: Fit, motion: Motion) -> Array:
+    """The model's force at every sample: speed and slip of the nearest used sample where a sample was left out."""
+    t, used = prepared.time_s, prepared.used
+    taken_off = prepared.deformation_um[used] - motion.compression_um
+    x = prepared.deformation_um - np.interp(t, t[used], taken_off)
+    nearest = used.searchsorted(np.arange(len(t))).clip(max=len(used) - 1)
+    for part in (prepared.branches.loading, prepared.branches.hold, prepared.branches.unloading):
+        inside = np.flatnonzero((used >= part.start) & (used < part.stop))
+        if len(inside):
+            nearest[part.start : part.stop] = nearest[part.start : part.stop].clip(inside[0], inside[-1])
+    force = force_of(fit.theta, Motion(x, motion.velocity_um_s[nearest], motion.acceleration_um_s2[nearest]))
+    for part in (prepared.branches.approach, prepared.branches.lost):
+        force[part.start : part.stop] = fit.theta[BASE]
+    return force + prepared.baseline_uN
+
+
+def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
+    if "single" not in protocols:
+        return "loading"
+    names: tuple[ProtocolName, ...] = ("single", "unloading_springs", "loading_only", "slip_corrected")
+    fitting: tuple[ProtocolName, ...] = ("single", "unloading_springs", "slip_corrected")
+    within = [name for name in fitting if protocols[name].within_noise]
+    if within:
+        return min(within, key=lambda name: protocols[name].likelihood_cost)
+    least = min(protocols[name].error_percent for name in names)
+    return next(name for name in names if protocols[name].error_percent <= _SIMPLER * least)
+
+
+def _slip(prepared: Prepared, fit: ProtocolFit | None, is_best: bool) -> Slip | None:
+    if fit is None:
+        return None
+    last = prepared.branches.unloading.stop
+    lost = prepared.branches.release_s is not None
+    left = float(np.mean(prepared.deformation_um[max(last - 2, 0) : last])) - fit.contact_um
+    return Slip(
+        fit.slip_um,
+        fit.sigma_slip_um,
+        fit.slip_rate_per_s,
+        fit.sigma_slip_rate_per_s,
+        left if lost else None,
+        is_best and fit.identifiable["slip"] and fit.identifiable["slip_rate"],
+    )
+
+
+def _notes(record: IndentationRecord, prepared: Prepared) -> list[str]:
+    notes = []
+    for what, stated, used, unit in (
+        ("deformation", record.deformation_sigma_um, prepared.deformation_sigma_um, "µm"),
+        ("force", record.force_sigma_uN, prepared.force_sigma_uN, "µN"),
+    ):
+        if stated > 0.0 and used > stated:
+            notes.append(f"the noise of the {what} is {used:.3g} {unit} as observed, {stated:.3g} {unit} as stated")
+    pulled = prepared.force_uN[prepared.used]
+    if np.sum(pulled < -6.0 * prepared.force_sigma_uN) >= 3:
+        notes.append(f"adhesion: the specimen pulls with up to {-pulled.min():.3g} µN, which the model does not have")
+    if prepared.contact.seen == "nothing":
+        notes.append("the record begins in contact: the contact point is that of the record's own zero")
+    if not len(prepared.branches.unloading):
+        notes.append("the record has no unloading: only the loading is fitted")
+    elif prepared.branches.release_s is None:
+        notes.append("the record ends in contact")
+    return notes

@@ -1,0 +1,131 @@
+"""Straight and parabolic fits to a few positions, and how much better a broken line would explain them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+
+class Point(NamedTuple):
+    """A position at an instant, with its weight in a fit."""
+
+    t_s: float
+    x_um: float
+    weight: float = 1.0
+
+
+class Fit(NamedTuple):
+    """A line, or parabola, in polynomials that are orthogonal over its points.
+
+    `norm0` … `norm2` are their squared lengths, `left_um2` is the sum of the squares that the fit leaves over.
+    """
+
+    middle_s: float
+    level_um: float
+    slope: float
+    bend: float
+    skew: float
+    spread: float
+    norm0: float
+    norm1: float
+    norm2: float
+    left_um2: float
+
+    def bow(self, u: float) -> float:
+        """The polynomial of second degree, `u` seconds from the middle."""
+        return (u - self.skew) * u - self.spread
+
+    def position_um(self, t_s: float) -> float:
+        """Where the fit is at an instant."""
+        u = t_s - self.middle_s
+        return self.level_um + self.slope * u + self.bend * self.bow(u)
+
+    def velocity_um_s(self, t_s: float) -> float:
+        """Its slope there."""
+        return self.slope + self.bend * (2.0 * (t_s - self.middle_s) - self.skew)
+
+    def velocity_spread_per_s(self, t_s: float) -> float:
+        """Standard deviation of that slope over the positions'; infinite where they do not tell it."""
+        if self.norm1 <= 0.0:
+            return math.inf
+        grow = 2.0 * (t_s - self.middle_s) - self.skew
+        return math.sqrt(1.0 / self.norm1 + (grow * grow / self.norm2 if self.norm2 > 0.0 else 0.0))
+
+
+def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
+    """Weighted least squares; fewer than three instants make no parabola and fewer than two no slope."""
+    # Sums about the newest point, so that no digits are lost.
+    zero_s, zero_um, _ = points[-1]
+    norm0 = first = level = second = rise = square = 0.0
+    for t, x, w in points:
+        u, y = t - zero_s, x - zero_um
+        wu, wy = w * u, w * y
+        norm0 += w
+        first += wu
+        level += wy
+        second += wu * u
+        rise += wu * y
+        square += wy * y
+    middle = first / norm0
+    level /= norm0
+    norm1 = second - middle * first
+    rise -= middle * level * norm0
+    slope = rise / norm1 if norm1 > 0.0 else 0.0
+    left = square - level * level * norm0 - slope * rise
+    line = Fit(zero_s + middle, zero_um + level, slope, 0.0, 0.0, 0.0, norm0, norm1, 0.0, left)
+    if not parabola or len(points) < 4:
+        return line
+    third = sum(w * (t - line.middle_s) ** 3 for t, _, w in points)
+    line = line._replace(skew=third / norm1, spread=norm1 / norm0)
+    norm2 = curve = 0.0
+    for t, x, w in points:
+        bow = line.bow(t - line.middle_s)
+        norm2 += w * bow * bow
+        curve += w * bow * (x - line.level_um)
+    return line._replace(bend=curve / norm2, norm2=norm2, left_um2=left - curve * curve / norm2)
+
+
+def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest: int) -> list[float]:
+    """By how much the sum of squares falls if the line may change its slope at `points[j]`, j from newest to oldest."""
+    gains = []
+    middle, norm0, norm1, norm2 = line.middle_s, line.norm0, line.norm1, line.norm2
+    # Sums over the points beyond j: residual, weight, weight × bow, each plain and times u.
+    r0 = r1 = w0 = w1 = w2 = b0 = b1 = 0.0
+    for j in range(len(points) - 1, oldest - 1, -1):
+        t, x, w = points[j]
+        u = t - middle
+        if j <= newest:
+            explained = r1 - u * r0
+            on0, on1 = w1 - u * w0, w2 - u * w1
+            own = w2 - 2.0 * u * w1 + u * u * w0 - on0 * on0 / norm0 - on1 * on1 / norm1
+            if norm2 > 0.0:
+                on2 = b1 - u * b0
+                own -= on2 * on2 / norm2
+            gains.append(explained * explained / own if own > 0.0 else 0.0)
+        residual = w * (x - line.position_um(t))
+        r0 += residual
+        r1 += residual * u
+        w0 += w
+        w1 += w * u
+        w2 += w * u * u
+        if norm2 > 0.0:
+            bow = w * line.bow(u)
+            b0 += bow
+            b1 += bow * u
+    return gains
+
+
+def shape_gain(points: Sequence[Point], line: Fit, shape: Sequence[float]) -> float:
+    """By how much the sum of squares falls if a multiple of `shape`, one value a point, is added to the fit."""
+    explained = on0 = on1 = on2 = own = 0.0
+    for (t, x, w), value in zip(points, shape, strict=True):
+        if value:
+            u = t - line.middle_s
+            explained += w * value * (x - line.position_um(t))
+            on0 += w * value
+            on1 += w * value * u
+            on2 += w * value * line.bow(u)
+            own += w * value * value
+    own -= on0 * on0 / line.norm0 + on1 * on1 / line.norm1 + (on2 * on2 / line.norm2 if line.norm2 > 0.0 else 0.0)
+    return explained * explained / own if own > 0.0 else 0.0

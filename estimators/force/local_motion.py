@@ -1,0 +1,260 @@
+"""Velocity on line that does not smear corners: short straight fits which never reach across one.
+
+A corner is where the motion reverses, starts or ends. It is looked for as the broken line that explains the newest
+positions so much better than a straight one that noise does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from microdrivers.core.units import NS_PER_S
+from microdrivers.estimators.force.line_fit import Fit, Point, broken_line_gains, fit, shape_gain
+from microdrivers.estimators.force.scatter import RunningScatter
+
+SHORTEST_LAG = 4
+"""Positions that must follow one so that a corner right before it is seen: two more, and one to screen those."""
+
+_MOST_BEYOND = 5
+_BEFORE = 3
+_LOOK_BACK = 10
+_CORNER = 30.0
+"""A corner explains as much as this many variances of one position; noise does so once in some 1e7 positions."""
+
+_SPIKE_SIGMAS = 5.0
+_ANCHOR_WEIGHT = 2.0
+_REFINED = 8
+_LEAST_SIGMA_UM = 1e-3
+_FAR = 1_000_000
+
+
+class MotionSettings(NamedTuple):
+    """How positions become velocities.
+
+    Attributes:
+        lag: positions that must follow one before its velocity is told, ≥ 4.
+        window: positions in a fit. 2·lag − 1 makes it symmetric, so that the velocity is that of its own instant; with
+            a shorter lag it is that of `(window + 1)/2 − lag` positions before.
+        with_acceleration: fit parabolas.
+        max_gap_s: positions further apart than this belong to different motions.
+    """
+
+    lag: int = 9
+    window: int = 17
+    with_acceleration: bool = False
+    max_gap_s: float = 0.25
+
+
+class Motion(NamedTuple):
+    """The motion at one instant.
+
+    Attributes:
+        t_ns: the position's instant.
+        position_um: as measured; as fitted where the measured one is a spike.
+        sigma_um: standard deviation of one measured position.
+        velocity_um_s, velocity_sigma_um_s: slope of the fit at that instant.
+        acceleration_um_s2: 0 unless it was asked for.
+        begin_ns: beginning of the stretch without a corner that it belongs to.
+        after_corner: whether that began with a corner rather than with the first position, a gap or a jump.
+        clearance: positions between this one and the nearest corner.
+        spike: the position lies far off both its neighbours, on the same side.
+    """
+
+    t_ns: int
+    position_um: float
+    sigma_um: float
+    velocity_um_s: float
+    velocity_sigma_um_s: float
+    acceleration_um_s2: float
+    begin_ns: int
+    after_corner: bool
+    clearance: int
+    spike: bool
+
+
+class _Position(NamedTuple):
+    t_ns: int
+    t_s: float
+    x_um: float
+    sigma_um: float
+    rank: int = 0
+    spike: bool = False
+
+
+class LocalMotion:
+    """Positions in, motions out, `lag` positions later and one for each.
+
+    A position that lies far off both neighbours, on the same side, is a spike: no fit uses it.
+
+    Raises:
+        ValueError: the lag is shorter than `SHORTEST_LAG` or the window not longer than the lag.
+    """
+
+    def __init__(self, settings: MotionSettings | None = None) -> None:
+        self.settings = settings or MotionSettings()
+        if not SHORTEST_LAG <= self.settings.lag < self.settings.window:
+            raise ValueError(
+                f"a lag of {self.settings.lag} in a window of {self.settings.window}: give 4 ≤ lag < window"
+            )
+        self._beyond = min(self.settings.lag - 1, _MOST_BEYOND)
+        self._scatter = RunningScatter()
+        self._zero_ns: int | None = None
+        self._newest: deque[_Position] = deque(maxlen=2)
+        self._unscreened = False
+        self._points: deque[Point] = deque(maxlen=self.settings.window)
+        self._pending: deque[_Position] = deque()
+        self._count = 0
+        self._begin_ns = 0
+        self._after_corner = False
+        self._speed_um_s = 0.0
+
+    def update(self, t_ns: int, x_um: float, sigma_um: float) -> list[Motion]:
+        """Take a position, newer than all before.
+
+        Returns:
+            The motions that are now certain, oldest first.
+        """
+        motions: list[Motion] = []
+        newest = self._newest
+        if newest and t_ns - newest[-1].t_ns > self.settings.max_gap_s * NS_PER_S:
+            motions = self.tell_now()
+            self._begin_anew()
+        if self._zero_ns is None:
+            self._zero_ns = t_ns
+        t_s = (t_ns - self._zero_ns) / NS_PER_S
+        self._scatter.add(t_s, x_um)
+        if self._unscreened:
+            motions += self._push(newest[-1], spike=self._is_spike(t_s, x_um))
+        if not newest:
+            self._begin_ns = t_ns
+        newest.append(_Position(t_ns, t_s, x_um, self._sigma_um(sigma_um)))
+        self._unscreened = True
+        return motions
+
+    def tell_now(self) -> list[Motion]:
+        """Tell what has not been told yet, from what is known; the motion goes on."""
+        motions = self._push(self._newest[-1], spike=False) if self._unscreened else []
+        self._unscreened = False
+        if self._pending:
+            motions += self._settle(len(self._pending), self._fit(self._points), self._count + _FAR)
+        return motions
+
+    def _begin_anew(self) -> None:
+        self._newest.clear()
+        self._points.clear()
+        self._count = 0
+        self._after_corner = False
+
+    # ------------------------------------------------------------------ one position
+
+    def _sigma_um(self, stated_um: float) -> float:
+        """What the positions scatter by; what is said of them until that is known, and at least half of it."""
+        seen_um = self._scatter.sigma
+        if math.isnan(seen_um):
+            return max(stated_um, _LEAST_SIGMA_UM)
+        return max(seen_um, 0.5 * stated_um, _LEAST_SIGMA_UM)
+
+    def _is_spike(self, t_s: float, x_um: float) -> bool:
+        """Whether the newest position sticks out between its neighbours, further than the peak of a reversal."""
+        if len(self._newest) < 2:
+            return False
+        before, middle = self._newest
+        beyond_um = max(min(before.x_um, x_um) - middle.x_um, middle.x_um - max(before.x_um, x_um))
+        return beyond_um > _SPIKE_SIGMAS * middle.sigma_um + self._speed_um_s * (t_s - before.t_s)
+
+    def _push(self, position: _Position, *, spike: bool) -> list[Motion]:
+        motions: list[Motion] = []
+        t_ns, t_s, x_um, sigma_um, _, _ = position
+        self._pending.append(_Position(t_ns, t_s, x_um, sigma_um, self._count, spike))
+        self._count += 1
+        if not spike:
+            self._points.append(Point(t_s, x_um))
+        if not self._points:
+            return motions
+        line = self._fit(self._points)
+        least_um2 = _CORNER * sigma_um * sigma_um
+        if line.left_um2 >= least_um2 and len(self._points) >= _BEFORE + self._beyond:
+            at = self._suspect(line, least_um2)
+            if at < len(self._points) - self._beyond:
+                motions = self._turn(*self._corner(line, at, least_um2))
+                line = self._fit(self._points)
+            elif at < len(self._points):
+                line = self._fit([*self._points][: at + 1])
+        self._speed_um_s = abs(line.slope)
+        surplus = len(self._pending) - (self.settings.lag - 1)
+        if surplus > 0:
+            motions += self._settle(surplus, line, self._count + _FAR)
+        return motions
+
+    def _fit(self, points: Sequence[Point]) -> Fit:
+        return fit(points, parabola=self.settings.with_acceleration)
+
+    def _settle(self, count: int, line: Fit, corner_rank: int) -> list[Motion]:
+        """Tell the oldest pending positions; the next corner lies right before the one with `corner_rank`."""
+        motions = []
+        for _ in range(count):
+            t_ns, t_s, x_um, sigma_um, rank, spike = self._pending.popleft()
+            clearance = corner_rank - 1 - rank
+            motions.append(
+                Motion(
+                    t_ns=t_ns,
+                    position_um=line.position_um(t_s) if spike else x_um,
+                    sigma_um=sigma_um,
+                    velocity_um_s=line.velocity_um_s(t_s),
+                    velocity_sigma_um_s=sigma_um * line.velocity_spread_per_s(t_s),
+                    acceleration_um_s2=2.0 * line.bend,
+                    begin_ns=self._begin_ns,
+                    after_corner=self._after_corner,
+                    clearance=min(clearance, rank) if self._after_corner else clearance,
+                    spike=spike,
+                )
+            )
+        return motions
+
+    # ------------------------------------------------------------------ corners
+
+    def _suspect(self, line: Fit, least_um2: float) -> int:
+        """Index of the point before a corner, if one explains as much as `least_um2`; else the number of points."""
+        points = self._points
+        newest = len(points) - 2
+        gains = broken_line_gains(points, line, newest=newest, oldest=max(_BEFORE - 1, newest - _LOOK_BACK))
+        best = max(gains)
+        return newest - gains.index(best) if best >= least_um2 else len(points)
+
+    def _corner(self, line: Fit, at: int, least_um2: float) -> tuple[float, bool]:
+        """Instant of the corner near a point, and whether it is a jump instead, by a clear margin."""
+        points = self._points
+        begin_s, end_s = points[at - 1].t_s, points[at + 1].t_s
+        best, corner_s = -1.0, begin_s
+        for step in range(_REFINED + 1):
+            instant_s = begin_s + (end_s - begin_s) * step / _REFINED
+            gain = shape_gain(points, line, [max(point.t_s - instant_s, 0.0) for point in points])
+            if gain > best:
+                best, corner_s = gain, instant_s
+        for j in range(at - 1, at + 2):
+            gain = shape_gain(points, line, [1.0 if i > j else 0.0 for i in range(len(points))])
+            if gain > best + least_um2:
+                return points[j].t_s, True
+        return corner_s, False
+
+    def _turn(self, corner_s: float, jump: bool) -> list[Motion]:
+        """Tell what lies before a corner, and begin a new motion there."""
+        assert self._zero_ns is not None
+        old = [point for point in self._points if point.t_s <= corner_s]
+        new = [point for point in self._points if point.t_s > corner_s]
+        line = self._fit(old)
+        past = sum(position.t_s <= corner_s for position in self._pending)
+        corner_rank = self._pending[past].rank
+        motions = self._settle(past, line, corner_rank)
+        self._points.clear()
+        if not jump:
+            self._points.append(Point(corner_s, line.position_um(corner_s), _ANCHOR_WEIGHT))
+        self._points.extend(new)
+        self._pending = deque(p._replace(rank=p.rank - corner_rank) for p in self._pending)
+        self._count -= corner_rank
+        self._begin_ns = self._zero_ns + round((new[0].t_s if jump else corner_s) * NS_PER_S)
+        self._after_corner = not jump
+        return motions

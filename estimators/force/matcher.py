@@ -1,0 +1,204 @@
+"""Brings what the camera sees and what the sensor feels to one instant: a frame's force is that of its exposure."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right, insort
+from collections import Counter
+from itertools import pairwise
+from typing import NamedTuple
+
+from microdrivers.core.contact_samples import DeformationSample, IndentationSample
+from microdrivers.core.samples import ForceSample, Sample
+from microdrivers.core.units import NS_PER_MS, NS_PER_S
+from microdrivers.estimators.force.scatter import RunningScatter
+
+_SENSOR_FAULTS = ("DISCONNECTED", "SATURATED", "STALE")
+
+
+class MatcherSettings(NamedTuple):
+    """When a frame is matched.
+
+    Attributes:
+        lateness_s: readings may come this much later than newer ones of the same sensor; a frame waits as long.
+        max_gap_s: a frame between readings further apart than this is given up.
+        max_waiting: frames that may wait for readings. max_readings: readings that may wait for frames.
+    """
+
+    lateness_s: float = 0.005
+    max_gap_s: float = 0.1
+    max_waiting: int = 64
+    max_readings: int = 8192
+
+
+class IndentationMatcher:
+    """Deformations and forces in, indentations out, each with the mean force over the exposure of its frame.
+
+    A frame waits until readings lie on either side of its exposure. If none lies within it, because the sensor is
+    slower than that, the force at mid-exposure is interpolated between the two around it; nothing is extrapolated.
+    How the two streams interleave changes nothing in what comes out; within the sensor's stream, readings may come
+    out of order by `lateness_s`.
+
+    `unmatched` counts the frames that were given up, by reason: LOST (the contact point was not seen), SATURATED,
+    STALE, DISCONNECTED or INVALID (such a reading lies in the exposure, or beside it where one would have to
+    interpolate), GAP (readings too far apart), UNBRACKETED (older than all readings), OVERFLOW (too many were
+    waiting), OUT_OF_ORDER (older than a frame that has been dealt with).
+
+    Args:
+        settings: when a frame is matched.
+        device: name under which the samples are published.
+    """
+
+    def __init__(self, settings: MatcherSettings | None = None, *, device: str = "indentation") -> None:
+        self.settings = settings or MatcherSettings()
+        self.device = device
+        self.unmatched: Counter[str] = Counter()
+        self.late_readings = 0
+        self._lateness_ns = round(self.settings.lateness_s * NS_PER_S)
+        self._max_gap_ns = round(self.settings.max_gap_s * NS_PER_S)
+        self._frames: list[DeformationSample] = []
+        self._readings: list[ForceSample] = []
+        self._newest_ns: int | None = None
+        self._done_ns: int | None = None
+        self._scatter = RunningScatter()
+        self._scattered = 0
+        self._seq = 0
+
+    @property
+    def waiting(self) -> int:
+        """Frames whose readings have not all come yet."""
+        return len(self._frames)
+
+    def update(self, sample: Sample) -> list[IndentationSample]:
+        """Take one sample of either stream; others are ignored.
+
+        Returns:
+            The indentations that it completed, oldest first.
+        """
+        if isinstance(sample, DeformationSample):
+            self._take_frame(sample)
+        elif isinstance(sample, ForceSample):
+            self._take_reading(sample)
+        matched = []
+        while self._frames and self._is_complete(self._frames[0]):
+            frame = self._frames.pop(0)
+            found = self._match(frame)
+            self._done_ns = frame.t_ns
+            if found is not None:
+                matched.append(found)
+        return matched
+
+    # ------------------------------------------------------------------ taking
+
+    def _take_frame(self, frame: DeformationSample) -> None:
+        if self._done_ns is not None and frame.t_ns <= self._done_ns:
+            self.unmatched["OUT_OF_ORDER"] += 1
+            return
+        insort(self._frames, frame, key=_instant)
+        if len(self._frames) > self.settings.max_waiting:
+            self._done_ns = self._frames.pop(0).t_ns
+            self.unmatched["OVERFLOW"] += 1
+
+    def _take_reading(self, reading: ForceSample) -> None:
+        if self._newest_ns is not None and reading.t_ns < self._newest_ns - self._lateness_ns:
+            self.late_readings += 1
+            return
+        if self._newest_ns is None or reading.t_ns > self._newest_ns:
+            self._newest_ns = reading.t_ns
+        insort(self._readings, reading, key=_instant)
+        surplus = len(self._readings) - self.settings.max_readings
+        if surplus > 0:
+            self._forget(surplus)
+
+    def _is_complete(self, frame: DeformationSample) -> bool:
+        """Whether no reading that matters can come any more."""
+        if not frame.found:
+            return True
+        return self._newest_ns is not None and self._newest_ns >= _end_ns(frame) + self._lateness_ns
+
+    # ------------------------------------------------------------------ one frame
+
+    def _match(self, frame: DeformationSample) -> IndentationSample | None:
+        if not frame.found:
+            self.unmatched["LOST"] += 1
+            return None
+        begin_ns, end_ns = 2 * frame.t_ns - _end_ns(frame), _end_ns(frame)
+        first = bisect_left(self._readings, begin_ns, key=_instant)
+        last = bisect_right(self._readings, end_ns, key=_instant)
+        before = bisect_right(self._readings, begin_ns, key=_instant) - 1
+        after = bisect_left(self._readings, end_ns, key=_instant)
+        if before < 0:
+            self.unmatched["UNBRACKETED"] += 1
+            return None
+        within = self._readings[first:last]
+        around = self._readings[before : after + 1]
+        self._settle(last)
+        reason = _fault(within or around)
+        if not reason and any(b.t_ns - a.t_ns > self._max_gap_ns for a, b in pairwise(around)):
+            reason = "GAP"
+        matched = None
+        if reason:
+            self.unmatched[reason] += 1
+        else:
+            matched = self._sample(frame, within, around[0], around[-1])
+        self._forget(before)
+        return matched
+
+    def _sample(
+        self, frame: DeformationSample, within: list[ForceSample], before: ForceSample, after: ForceSample
+    ) -> IndentationSample:
+        if within:
+            force_uN = sum(reading.force_uN for reading in within) / len(within)
+            spread = 1.0 / math.sqrt(len(within))
+            used = within
+        else:
+            share = (frame.t_ns - before.t_ns) / (after.t_ns - before.t_ns)
+            force_uN = (1.0 - share) * before.force_uN + share * after.force_uN
+            spread = math.hypot(1.0 - share, share)
+            used = [before, after]
+        seq, self._seq = self._seq, self._seq + 1
+        return IndentationSample(
+            t_ns=frame.t_ns,
+            dt_ns=frame.dt_ns,
+            t_source="computed",
+            device=self.device,
+            seq=seq,
+            flags=frame.flags.union(*(reading.flags for reading in used)),
+            deformation_um=frame.deformation_um,
+            deformation_sigma_um=frame.sigma_um,
+            force_uN=force_uN,
+            force_sigma_uN=spread * self._scatter.sigma,
+            readings=len(within),
+            frame_seq=frame.frame_seq,
+        )
+
+    def _settle(self, until: int) -> None:
+        """Let the scatter see the readings before index `until`, in order of time."""
+        for reading in self._readings[self._scattered : until]:
+            self._scatter.add(reading.t_ns, reading.force_uN)
+        self._scattered = max(self._scattered, until)
+
+    def _forget(self, count: int) -> None:
+        """Drop the oldest readings."""
+        self._settle(count)
+        del self._readings[:count]
+        self._scattered -= count
+
+
+def _instant(sample: Sample) -> int:
+    return sample.t_ns
+
+
+def _end_ns(frame: DeformationSample) -> int:
+    return frame.t_ns + round(frame.exposure_ms * NS_PER_MS / 2.0)
+
+
+def _fault(readings: list[ForceSample]) -> str:
+    """What is wrong with the first reading that is not valid; empty if all are."""
+    for reading in readings:
+        for flag in _SENSOR_FAULTS:
+            if flag in reading.flags:
+                return flag
+        if not math.isfinite(reading.force_uN):
+            return "INVALID"
+    return ""

@@ -1,0 +1,98 @@
+"""The specimen's model, Bilen et al., eq. (21), with the slip of eq. (26): deformation in, force out."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class SpecimenModel(NamedTuple):
+    """An identified specimen: `F = m·ẍ + b·ẋ + k1·x + k2·x³`, x ≥ 0 the compression from the undeformed surface.
+
+    Attributes:
+        k1_uN_per_um: linear spring.
+        k2_uN_per_um3: hardening spring.
+        b_loading_uN_s_per_um: damper while the compression grows.
+        b_unloading_uN_s_per_um: damper while it shrinks.
+        m_kg: mass; 1 kg·µm/s² is 1 µN. 0 where it was not estimated.
+        contact_um: where x = 0 lies in the deformation's own coordinate.
+        slip_um: how far the specimen slips into its holder in the end, eq. (26).
+        slip_rate_per_s: α of eq. (26).
+        covariance: of (k1, k2, b_loading), row-major 3 × 3, in these units; empty if unknown.
+        residual_uN: RMS of what the model left over when it was identified.
+        deepest_um: largest compression that was characterised.
+        fastest_um_s: largest speed of compression that was characterised, of either sign.
+    """
+
+    k1_uN_per_um: float
+    k2_uN_per_um3: float
+    b_loading_uN_s_per_um: float
+    b_unloading_uN_s_per_um: float
+    m_kg: float = 0.0
+    contact_um: float = 0.0
+    slip_um: float = 0.0
+    slip_rate_per_s: float = 0.0
+    covariance: tuple[float, ...] = ()
+    residual_uN: float = 0.0
+    deepest_um: float = math.inf
+    fastest_um_s: float = math.inf
+
+
+def force_uN(
+    model: SpecimenModel,
+    compression_um: npt.ArrayLike,
+    velocity_um_s: npt.ArrayLike,
+    acceleration_um_s2: npt.ArrayLike = 0.0,
+    *,
+    adhesion: bool = False,
+) -> Array:
+    """Force on the tool, Bilen et al., eq. (21); arguments broadcast.
+
+    Args:
+        model: the specimen.
+        compression_um: x, what the slip leaves of the deformation; the tool does not touch where x ≤ 0.
+        velocity_um_s: ẋ, positive while loading.
+        acceleration_um_s2: ẍ.
+        adhesion: the specimen may pull: forces below zero and beyond the surface are kept.
+
+    Returns:
+        µN, positive where the specimen pushes the tool away; never negative unless `adhesion`.
+    """
+    x = np.asarray(compression_um, dtype=np.float64)
+    v = np.asarray(velocity_um_s, dtype=np.float64)
+    a = np.asarray(acceleration_um_s2, dtype=np.float64)
+    damper = np.where(v > 0.0, model.b_loading_uN_s_per_um, model.b_unloading_uN_s_per_um)
+    force: Array = model.m_kg * a + damper * v + (model.k1_uN_per_um + model.k2_uN_per_um3 * x * x) * x
+    if adhesion:
+        return force
+    # NaN stays NaN: a deformation that was not seen has no force.
+    return np.where(x <= 0.0, 0.0, np.maximum(force, 0.0))
+
+
+def slipped_um(model: SpecimenModel, since_contact_s: npt.ArrayLike) -> Array:
+    """How far the specimen has slipped, Bilen et al., eq. (26): `offset·(1 − e^(−α t))`, 0 before contact.
+
+    Args:
+        model: the specimen.
+        since_contact_s: t, time since the tool touched.
+    """
+    t = np.maximum(np.asarray(since_contact_s, dtype=np.float64), 0.0)
+    return -model.slip_um * np.expm1(-model.slip_rate_per_s * t)
+
+
+def slip_speed_um_s(model: SpecimenModel, since_contact_s: npt.ArrayLike) -> Array:
+    """Rate of `slipped_um`, µm/s; 0 before contact."""
+    t = np.asarray(since_contact_s, dtype=np.float64)
+    rate = model.slip_um * model.slip_rate_per_s * np.exp(-model.slip_rate_per_s * np.maximum(t, 0.0))
+    return np.where(t < 0.0, 0.0, rate)
+
+
+def stiffness_uN_per_um(model: SpecimenModel, compression_um: npt.ArrayLike) -> Array:
+    """Slope of the springs at a compression, `k1 + 3 k2 x²`, µN/µm."""
+    x = np.asarray(compression_um, dtype=np.float64)
+    return model.k1_uN_per_um + 3.0 * model.k2_uN_per_um3 * x * x

@@ -1,0 +1,288 @@
+"""A record made ready for fits: noise, branches, baseline, what is left out and why, what is known of the contact."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from microdrivers.core.errors import DataError
+from microdrivers.estimators.force.branches import Branches, find_branches
+from microdrivers.estimators.force.joint import BASE, CONTACT, CONTACT_S, PARAMETERS, Prior
+from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.record import IndentationRecord, lost, saturated, white_sigma
+
+Indices = npt.NDArray[np.int64]
+SeenBefore = Literal["surface", "tip", "nothing"]
+
+LOADING, HOLD, UNLOADING = 0, 1, 2
+"""Numbers of the branches in contact."""
+
+_FEWEST_IN_FIT = 10
+_SHORTEST_BASELINE = 15
+_LARGEST_SHARE = 0.2
+"""Of a branch's samples: what may be left out at either end."""
+_MOVES = 0.5
+"""Of the loading speed: what moves at that before the contact is the tool, not the specimen."""
+_SHORTEST_HOLD_S = 1.0
+_CLEAR_SLOPE = 4.0
+_TIP_SAMPLES = 30
+"""Before the contact, that tell whether the deformation follows the tool and how."""
+
+
+class ContactKnowledge(NamedTuple):
+    """What is known of the contact apart from the fit.
+
+    Attributes:
+        seen: what the deformation followed before the contact: the undeformed surface, the tool's tip, or nothing
+            since the record begins in contact.
+        contact_um: where the surface is. contact_s: when it was touched, from the force alone.
+        sigma_um: standard deviation of `contact_um` (surface), or of the tip's line at a given instant (tip).
+        sigma_s: standard deviation of `contact_s`; 0 if it is not observed at all.
+        speed_um_s: of the tip before the contact; 0 if the surface was seen.
+    """
+
+    seen: SeenBefore
+    contact_um: float
+    contact_s: float
+    sigma_um: float
+    sigma_s: float
+    speed_um_s: float
+
+    def priors(self) -> list[Prior]:
+        """The same as priors on the parameters."""
+        at, when = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
+        at[CONTACT], when[CONTACT_S] = 1.0, 1.0
+        if self.seen == "nothing":
+            return [Prior(at, self.contact_um, self.sigma_um)]
+        at[CONTACT_S] = -self.speed_um_s
+        line = self.contact_um - self.speed_um_s * self.contact_s
+        return [Prior(at, line, self.sigma_um), Prior(when, self.contact_s, self.sigma_s)]
+
+
+class Margins(NamedTuple):
+    """Time left out of loading, hold and unloading: at the beginning, and at the end."""
+
+    begin_s: tuple[float, ...]
+    end_s: tuple[float, ...]
+
+    @classmethod
+    def same(cls, margin_s: float) -> Margins:
+        """The same at all ends."""
+        return cls((margin_s,) * 3, (margin_s,) * 3)
+
+
+class Prepared(NamedTuple):
+    """A record without its baseline, and what is used of it.
+
+    Attributes:
+        time_s, deformation_um, force_uN: all samples; the baseline is taken off the force.
+        measured: where deformation and force were measured.
+        deformation_sigma_um, force_sigma_uN: noise, as stated or, if that is more, as observed.
+        branches: of the record.
+        used: indices of the samples that fits may use, in order. branch: number of the branch of each.
+        excluded: reason → indices of the other samples.
+        contact: what is known of it before any fit.
+        baseline_uN: what was taken off. baseline_sigma_uN: its standard deviation; 0 where there was none to see.
+        frame_s: usual interval of samples.
+        depth_um: range of the deformation.
+    """
+
+    time_s: Array
+    deformation_um: Array
+    force_uN: Array
+    measured: npt.NDArray[np.bool_]
+    deformation_sigma_um: float
+    force_sigma_uN: float
+    branches: Branches
+    used: Indices
+    branch: Indices
+    excluded: dict[str, Indices]
+    contact: ContactKnowledge
+    baseline_uN: Array
+    baseline_sigma_uN: float
+    frame_s: float
+    depth_um: float
+
+    def priors(self) -> list[Prior]:
+        """What is known of contact and baseline apart from the samples in contact."""
+        row = np.zeros(PARAMETERS)
+        row[BASE] = 1.0
+        base = [Prior(row, 0.0, self.baseline_sigma_uN)] if self.baseline_sigma_uN > 0.0 else []
+        return self.contact.priors() + base
+
+
+def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins) -> Prepared:
+    """Make a checked record ready.
+
+    Args:
+        record: one that `check` accepts.
+        around_reversal: samples left out on either side of contact, reversals and release.
+        margins: left out besides, where the motion has not settled.
+
+    Raises:
+        DataError: too few samples are left. NoContact: the force does not rise.
+    """
+    time_s = np.asarray(record.time_s, dtype=np.float64)
+    full, unseen = saturated(record), lost(record)
+    measured = ~(full | unseen)
+    deformation, force = (
+        np.interp(time_s, time_s[measured], np.asarray(values, dtype=np.float64)[measured])
+        for values in (record.deformation_um, record.force_uN)
+    )
+    sigma_x = _noise(record.deformation_sigma_um, deformation)
+    sigma_f = _noise(record.force_sigma_uN, force)
+    branches = find_branches(time_s, deformation, force, deformation_sigma_um=sigma_x, force_sigma_uN=sigma_f)
+    frame_s = float(np.median(np.diff(time_s)))
+    base, base_sigma = _baseline(time_s, force, branches, measured, sigma_f, around_reversal)
+    reasons = {
+        "before contact": _mask(len(time_s), branches.approach),
+        "lost contact": _mask(len(time_s), branches.lost),
+        "not measured": unseen,
+        "saturated": full,
+        **_turning(time_s, branches, around_reversal, margins),
+    }
+    excluded, free = {}, np.ones(len(time_s), dtype=bool)
+    for reason, mask in reasons.items():
+        if np.any(mask & free):
+            excluded[reason] = np.flatnonzero(mask & free)
+        free &= ~mask
+    number = np.full(len(time_s), -1)
+    for index, part in ((LOADING, branches.loading), (HOLD, branches.hold), (UNLOADING, branches.unloading)):
+        number[part.start : part.stop] = index
+    used = np.flatnonzero(free)
+    loading = int(np.sum(number[used] == LOADING))
+    if loading < _FEWEST_IN_FIT:
+        raise DataError(
+            f"{loading} samples of the loading are usable, at least {_FEWEST_IN_FIT} are needed",
+            remedy="indent deeper or slower, or record at a higher rate",
+        )
+    return Prepared(
+        time_s=time_s,
+        deformation_um=deformation,
+        force_uN=force - base,
+        measured=measured,
+        deformation_sigma_um=sigma_x,
+        force_sigma_uN=sigma_f,
+        branches=branches,
+        used=used,
+        branch=number[used],
+        excluded=excluded,
+        contact=_contact(time_s, deformation, force, branches, sigma_x, sigma_f, frame_s, around_reversal),
+        baseline_uN=base,
+        baseline_sigma_uN=base_sigma,
+        frame_s=frame_s,
+        depth_um=float(np.ptp(deformation)),
+    )
+
+
+def _noise(stated: float, values: Array) -> float:
+    """Stated noise, unless more of it is seen; a trace of the values' range where there is none at all."""
+    stated = stated if np.isfinite(stated) else 0.0
+    observed = white_sigma(values)
+    # The observation itself scatters by some percent: only what is clearly more overrules a statement.
+    if np.isfinite(observed) and observed > 1.2 * stated:
+        return max(observed, 1e-9 * float(np.ptp(values)))
+    return max(stated, 1e-9 * float(np.ptp(values)))
+
+
+def _mask(n: int, part: range) -> npt.NDArray[np.bool_]:
+    mask = np.zeros(n, dtype=bool)
+    mask[part.start : part.stop] = True
+    return mask
+
+
+def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -> dict[str, npt.NDArray[np.bool_]]:
+    """Samples next to contact, reversals and release, and those about them in which the speed settles."""
+    n = len(time_s)
+    near, settling = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    parts = (branches.loading, branches.hold, branches.unloading)
+    for index, part in enumerate(parts):
+        most = int(_LARGEST_SHARE * len(part))
+        before_turn = any(len(later) for later in parts[index + 1 :]) or branches.release_s is not None
+        begins = index > 0 or branches.onset_s is not None
+        count = min(around, max(most, 1))
+        if len(part) and begins:
+            near[part.start : part.start + count] = True
+            until = time_s[part.start] + margins.begin_s[index]
+            settled = min(int(np.searchsorted(time_s, until)), part.start + most)
+            settling[part.start : settled] = True
+        if len(part) and before_turn:
+            near[max(part.stop - count, part.start) : part.stop] = True
+            since = time_s[part.stop - 1] - margins.end_s[index]
+            unsettled = max(int(np.searchsorted(time_s, since, side="right")), part.stop - most)
+            settling[unsettled : part.stop] = True
+    hold = branches.hold
+    if len(hold) and time_s[hold.stop - 1] - time_s[hold.start] < _SHORTEST_HOLD_S:
+        # A stage that turns round slowly.
+        near[hold.start : hold.stop] = True
+    return {"around contact and reversals": near, "speed not settled": settling}
+
+
+def _baseline(
+    time_s: Array, force: Array, branches: Branches, measured: npt.NDArray[np.bool_], sigma: float, around: int
+) -> tuple[Array, float]:
+    """The force out of contact: a constant, or a line if there is enough of it at both ends and it drifts clearly."""
+    before = _at_rest(range(branches.approach.start, branches.approach.stop - around), measured)
+    after = _at_rest(range(branches.lost.start + around, branches.lost.stop), measured)
+    rest = np.concatenate([before, after])
+    if not len(rest):
+        return np.zeros_like(time_s), 0.0
+    level = float(np.mean(force[rest]))
+    if min(len(before), len(after)) >= _SHORTEST_BASELINE:
+        t = time_s[rest] - time_s[rest].mean()
+        slope, slope_sigma = float(t @ force[rest] / (t @ t)), sigma / float(np.sqrt(t @ t))
+        if abs(slope) > _CLEAR_SLOPE * slope_sigma:
+            return level + slope * (time_s - time_s[rest].mean()), sigma / float(np.sqrt(len(rest)))
+    return np.full_like(time_s, level), sigma / float(np.sqrt(len(rest)))
+
+
+def _at_rest(part: range, measured: npt.NDArray[np.bool_]) -> Indices:
+    indices = np.arange(part.start, max(part.stop, part.start))
+    kept: Indices = indices[measured[indices]]
+    return kept
+
+
+def _contact(
+    time_s: Array, deformation: Array, force: Array, branches: Branches, sigma_x: float, sigma_f: float,
+    frame_s: float, around: int,
+) -> ContactKnowledge:  # fmt: skip
+    loading = branches.loading
+    usual = float(
+        (deformation[loading.stop - 1] - deformation[loading.start])
+        / (time_s[loading.stop - 1] - time_s[loading.start])
+    )
+    if branches.onset_s is None:
+        # It begins in contact: its own zero is the surface, no better than the way of one frame, nor than the way that
+        # the force takes which is there already.
+        begin = slice(loading.start, loading.start + max(len(loading) // 5, 3))
+        slope = float(np.polynomial.polynomial.polyfit(deformation[begin], force[begin], 1)[1])
+        pressed = abs(float(force[loading.start])) / slope if slope > 0.0 else 0.0
+        sigma = float(np.hypot(usual * frame_s, pressed))
+        return ContactKnowledge("nothing", 0.0, float(time_s[0]), sigma, 0.0, 0.0)
+    last, first = branches.onset_s
+    # A force that rises slowly is noticed late.
+    few = force[loading.start : loading.start + 6]
+    rise = max(float(few[-1] - few[0]) / (frame_s * max(len(few) - 1, 1)), 1e-12)
+    early, late = last - min(6.0 * sigma_f / rise, 5.0 * frame_s), first
+    contact_s, sigma_s = (early + late) / 2.0, float((late - early) / np.sqrt(12.0))
+    stop = max(branches.approach.stop - around, 2)
+    level, sigma, slope, _ = _line(time_s, deformation, max(stop - _TIP_SAMPLES, 0), stop, contact_s, sigma_x)
+    if abs(slope) > _MOVES * usual:
+        return ContactKnowledge("tip", level, contact_s, sigma, sigma_s, slope)
+    level, sigma, slope, slope_sigma = _line(time_s, deformation, 0, stop, contact_s, sigma_x)
+    if abs(slope) < _CLEAR_SLOPE * slope_sigma:
+        level, sigma = float(np.mean(deformation[:stop])), sigma_x / float(np.sqrt(stop))
+    # Otherwise the specimen creeps before it is touched: where it was at the contact counts.
+    return ContactKnowledge("surface", level, contact_s, sigma, sigma_s, 0.0)
+
+
+def _line(
+    time_s: Array, deformation: Array, start: int, stop: int, at_s: float, noise: float
+) -> tuple[float, float, float, float]:
+    """Value and slope of a straight line at an instant, each followed by its standard deviation."""
+    t = time_s[start:stop] - at_s
+    level, slope = np.polynomial.polynomial.polyfit(t, deformation[start:stop], 1)
+    spread = np.linalg.inv(np.array([[len(t), t.sum()], [t.sum(), t @ t]])) * noise**2
+    return float(level), float(np.sqrt(spread[0, 0])), float(slope), float(np.sqrt(spread[1, 1]))

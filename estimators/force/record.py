@@ -1,0 +1,223 @@
+"""One indentation as recorded, and what makes it unusable."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from microdrivers.core.errors import DataError, NoContact, SaturatedData, TargetLost
+from microdrivers.estimators.force.model import Array
+
+Mask = npt.NDArray[np.bool_]
+
+FEWEST_SAMPLES = 20
+LONGEST_GAP = 10.0
+"""Of the median interval between samples."""
+
+FLAT_RUN = 5
+"""Samples at one and the same extreme force that are taken for a sensor at the end of its range."""
+
+CLEAR = 6.0
+"""Standard deviations that are no noise."""
+
+_SOFTEST_PA, _HARDEST_PA = 150.0, 1e9
+_LARGEST_FORCE_UN = 1e5
+_PA_PER_UN_UM2 = 1e6
+_STATED_OVER_OBSERVED_NOISE = (300.0, 3000.0)
+"""Of a force in mN whose noise is stated in µN."""
+
+_USABLE_SHARE = 0.5
+
+
+class IndentationRecord(NamedTuple):
+    """One indentation: approach, loading, hold if any, unloading; equal lengths.
+
+    Attributes:
+        time_s: instants of the frames, increasing.
+        deformation_um: of the contact point, positive into the specimen. NaN only where `lost`.
+        force_uN: mean of the sensor's force over each frame's exposure, positive while it is pressed, tared.
+        deformation_sigma_um: standard deviation of a deformation, white; 0 or NaN if unknown.
+        force_sigma_uN: standard deviation of a force, white; 0 or NaN if unknown.
+        lost: where the contact point was not seen or the force not valid; None if nowhere.
+        saturated: where the sensor said that it was at the end of its range; None if nowhere.
+    """
+
+    time_s: Array
+    deformation_um: Array
+    force_uN: Array
+    deformation_sigma_um: float = 0.0
+    force_sigma_uN: float = 0.0
+    lost: Mask | None = None
+    saturated: Mask | None = None
+
+
+def lost(record: IndentationRecord) -> Mask:
+    """Where the record says that nothing was measured."""
+    return np.zeros(len(record.time_s), dtype=bool) if record.lost is None else np.asarray(record.lost, dtype=bool)
+
+
+def saturated(record: IndentationRecord) -> Mask:
+    """Where the sensor was at the end of its range: as it said, and where an extreme force repeats exactly."""
+    said = lost(record) & False if record.saturated is None else np.asarray(record.saturated, dtype=bool)
+    force = np.where(lost(record), np.nan, record.force_uN)
+    found = said.copy()
+    largest = np.nanmax(np.abs(force), initial=0.0)
+    for extreme in (largest, -largest):
+        at = force == extreme
+        # A run of equal readings next to each other; a coarse sensor repeats, but not for long while it is pressed.
+        for first, last in runs(at):
+            if last - first >= FLAT_RUN and largest > 0.0:
+                found[first:last] = True
+    return found
+
+
+def runs(mask: Mask) -> list[tuple[int, int]]:
+    """Half-open index ranges where a mask holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def white_sigma(values: Array) -> float:
+    """Standard deviation of the white noise on a smooth curve, from third differences; robust against its kinks."""
+    third = np.diff(values, 3)
+    third = third[np.isfinite(third)]
+    if len(third) < FEWEST_SAMPLES // 2:
+        return float("nan")
+    # Third differences of white noise have variance 20; the median of |normal| is 0.6745 standard deviations.
+    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+
+
+def check(record: IndentationRecord) -> None:
+    """Refuse what cannot be an indentation.
+
+    A stretch that is marked `lost` or `saturated` is no error: it is left out later.
+
+    Raises:
+        DataError: wrong shapes, too short, time not increasing, a gap, NaN, constant force, implausible units, wrong
+            sign.
+        NoContact: the force never leaves its noise.
+        SaturatedData: most of the record is at the end of the sensor's range.
+        TargetLost: the contact point was lost in most of the record.
+    """
+    _check_shapes(record)
+    _check_time(record.time_s)
+    unseen = lost(record)
+    if np.mean(unseen) > _USABLE_SHARE:
+        raise TargetLost(
+            f"the contact point or the force was lost in {np.sum(unseen)} of {len(unseen)} samples",
+            remedy="check focus, light and texture at the contact point, and the sensor; then indent again",
+        )
+    for name, values in (("deformation_um", record.deformation_um), ("force_uN", record.force_uN)):
+        bad = np.flatnonzero(~np.isfinite(values) & ~unseen)
+        if len(bad):
+            raise DataError(
+                f"{name} is not a number in {len(bad)} samples, first at {record.time_s[bad[0]]:.3f} s",
+                remedy="mark the samples as lost, or record again",
+            )
+    _check_force(record, unseen)
+    _check_units(record, unseen)
+
+
+def _check_shapes(record: IndentationRecord) -> None:
+    columns = (record.time_s, record.deformation_um, record.force_uN, record.lost, record.saturated)
+    shapes = [np.shape(column) for column in columns if column is not None]
+    n = len(record.time_s)
+    if any(shape != (n,) for shape in shapes):
+        raise DataError(
+            f"the columns of the record differ in length: {', '.join(map(str, shapes))}",
+            remedy="give one value of each column a sample",
+        )
+    if n < FEWEST_SAMPLES:
+        raise DataError(
+            f"the record has {n} samples; at least {FEWEST_SAMPLES} are needed",
+            remedy="indent deeper or slower, or record at a higher rate",
+        )
+
+
+def _check_time(time_s: Array) -> None:
+    if not np.all(np.isfinite(time_s)):
+        raise DataError("time_s is not a number in places", remedy="every sample needs its time, in s")
+    step = np.diff(time_s)
+    back = np.flatnonzero(step <= 0.0)
+    if len(back):
+        raise DataError(
+            f"time does not increase after {time_s[back[0]]:.6f} s (sample {back[0]}), and {len(back)} times in all",
+            remedy="sort the record and remove repeated samples",
+        )
+    usual = float(np.median(step))
+    longest = int(np.argmax(step))
+    if step[longest] > LONGEST_GAP * usual:
+        raise DataError(
+            f"gap of {step[longest]:.3f} s after {time_s[longest]:.3f} s; samples come every {usual:.4f} s",
+            remedy="record again without dropped frames, or keep the frames and mark them as lost",
+        )
+
+
+def _check_force(record: IndentationRecord, unseen: Mask) -> None:
+    full = saturated(record)
+    if np.mean(full) > _USABLE_SHARE:
+        raise SaturatedData(
+            f"the sensor is at the end of its range ({record.force_uN[full][0]:.6g} µN) in {np.sum(full)} of "
+            f"{len(full)} samples",
+            remedy="indent less deep, or use a sensor with a wider range",
+        )
+    force = record.force_uN[~unseen]
+    if np.ptp(force) == 0.0:
+        raise DataError(
+            f"the force is constant, {force[0]:.6g} µN",
+            remedy="check that the sensor is connected, in range and read during the indentation",
+        )
+    noise = _noise(record.force_sigma_uN, force)
+    # Medians of five: a single outlier is no contact.
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(force, 5), axis=1)
+    if np.ptp(smooth) < CLEAR * noise:
+        raise NoContact(
+            f"no contact: the force varies by {np.ptp(smooth):.3g} µN over the whole travel, noise is {noise:.3g} µN",
+            remedy="check that the probe reaches the specimen, the height and aim of the probe, and the sensor",
+        )
+    if smooth.max() - smooth[0] < smooth[0] - smooth.min() and not _starts_deep(record, unseen):
+        raise DataError(
+            f"the specimen pulls: the force goes from {smooth[0]:.4g} down to {smooth.min():.4g} µN",
+            remedy="forces are positive while the probe is pressed: check the sensor's axis and sign in the rig file",
+        )
+
+
+def _starts_deep(record: IndentationRecord, unseen: Mask) -> bool:
+    """The record begins at the deepest point: unloading alone, where the force goes down."""
+    deformation = record.deformation_um[~unseen]
+    return bool(deformation[0] > np.median(deformation))
+
+
+def _check_units(record: IndentationRecord, unseen: Mask) -> None:
+    deformation, force = record.deformation_um[~unseen], record.force_uN[~unseen]
+    depth = float(np.ptp(deformation))
+    if depth < CLEAR * _noise(record.deformation_sigma_um, deformation) or depth == 0.0:
+        raise DataError(
+            f"the deformation varies by {depth:.3g} µm only, which is its noise",
+            remedy="check that the camera follows the contact point, and that deformation_um is in µm",
+        )
+    largest = float(np.max(np.abs(force)))
+    stiffness_Pa = float(np.ptp(force)) / depth**2 * _PA_PER_UN_UM2
+    remedy = "give time_s in s, deformation in µm and force in µN (1 mN is 1000 µN)"
+    if not _SOFTEST_PA <= stiffness_Pa <= _HARDEST_PA:
+        raise DataError(
+            f"implausible units: {np.ptp(force):.4g} µN at {depth:.4g} µm is a modulus (force over depth squared) of "
+            f"{stiffness_Pa:.3g} Pa; soft matter has {_SOFTEST_PA:g} Pa to {_HARDEST_PA:g} Pa",
+            remedy=remedy,
+        )
+    if largest > _LARGEST_FORCE_UN:
+        raise DataError(f"implausible units: a force of {largest:.4g} µN", remedy=remedy)
+    observed = white_sigma(record.force_uN)
+    low, high = (share * observed for share in _STATED_OVER_OBSERVED_NOISE)
+    if low < record.force_sigma_uN < high:
+        raise DataError(
+            f"implausible units: the force has noise of {observed:.3g} µN, stated is {record.force_sigma_uN:.3g} µN",
+            remedy=remedy,
+        )
+
+
+def _noise(stated: float, values: Array) -> float:
+    observed = white_sigma(values)
+    return max(stated if np.isfinite(stated) else 0.0, observed if np.isfinite(observed) else 0.0)

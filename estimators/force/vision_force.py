@@ -1,0 +1,175 @@
+"""Force from the camera alone: the deformation of a specimen that has been identified before (Bilen et al., II.B)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+from microdrivers.core.contact_samples import DeformationSample, VisionForceSample
+from microdrivers.core.samples import Sample
+from microdrivers.core.units import NS_PER_S
+from microdrivers.estimators.force.local_motion import LocalMotion, Motion, MotionSettings
+from microdrivers.estimators.force.model import (
+    SpecimenModel,
+    force_uN,
+    slip_speed_um_s,
+    slipped_um,
+    stiffness_uN_per_um,
+)
+
+OUTSIDE_RANGE, LOST = "OUTSIDE_RANGE", "LOST"
+
+_TOUCH_SIGMAS = 5.0
+_RANGE_SIGMAS = 5.0
+_AT_REST_UM = 1.0
+
+
+class VisionForceSettings(NamedTuple):
+    """How the velocity is told.
+
+    Attributes:
+        lag: frames that must follow one before its force is published, ≥ 4: what it takes to see on which side of a
+            reversal a frame lies. At 30 Hz, 5 frames are 167 ms.
+        window: frames in the straight fit that gives the velocity, fewer after a corner of the motion. Where the speed
+            changes smoothly, the velocity is that of `(window + 1)/2 − lag` frames before.
+        max_gap_s: frames further apart than this give no velocity across the gap.
+    """
+
+    lag: int = 5
+    window: int = 20
+    max_gap_s: float = 0.25
+
+
+class VisionForce:
+    """Deformations in; out, `lag` frames later and stamped with the frame's own time, the force that the model tells.
+
+    There is no force until the camera shows contact: until the deformation begins to grow so that the model's force
+    exceeds what noise explains. It ends when the model's force is used up; it is never negative. The slip of eq. (26)
+    runs from the instant at which the deformation began. The mass is left out: a camera tells no acceleration.
+
+    `sigma_uN` adds up the model's covariance and residual, the noise of the deformation and that of the velocity.
+    A frame that is lost is published at once, and before it all that wait, by what was known until then.
+
+    Args:
+        model: the identified specimen.
+        settings: how the velocity is told.
+        device: name under which the samples are published.
+    """
+
+    def __init__(
+        self, model: SpecimenModel, settings: VisionForceSettings | None = None, *, device: str = "vision_force"
+    ) -> None:
+        self.model = model
+        self.settings = settings or VisionForceSettings()
+        self.device = device
+        self.late_frames = 0
+        self._motion = LocalMotion(
+            MotionSettings(lag=self.settings.lag, window=self.settings.window, max_gap_s=self.settings.max_gap_s)
+        )
+        self._waiting: deque[DeformationSample] = deque()
+        self._newest_ns: int | None = None
+        self._touches = False
+        self._touched_ns: int | None = None
+        self._seq = 0
+
+    @property
+    def touches(self) -> bool:
+        """Whether the tool was in contact at the newest force published."""
+        return self._touches
+
+    @property
+    def touched_ns(self) -> int | None:
+        """When the contact began, as the camera shows it; None before it, and after the specimen has come back."""
+        return self._touched_ns
+
+    def update(self, sample: Sample) -> list[VisionForceSample]:
+        """Take one deformation; other samples are ignored, and so is one that is not newer than all before.
+
+        Returns:
+            The forces that are now certain, oldest first.
+        """
+        if not isinstance(sample, DeformationSample):
+            return []
+        if self._newest_ns is not None and sample.t_ns <= self._newest_ns:
+            self.late_frames += 1
+            return []
+        self._newest_ns = sample.t_ns
+        if not sample.found or not math.isfinite(sample.deformation_um):
+            forces = [self._force(motion) for motion in self._motion.tell_now()]
+            return [*forces, self._publish(sample, math.nan, math.nan, math.nan, {LOST})]
+        self._waiting.append(sample)
+        return [
+            self._force(motion) for motion in self._motion.update(sample.t_ns, sample.deformation_um, sample.sigma_um)
+        ]
+
+    # ------------------------------------------------------------------ one frame
+
+    def _force(self, motion: Motion) -> VisionForceSample:
+        frame = self._waiting.popleft()
+        x_um, v_um_s = self._compression(motion)
+        seen_uN = self._seen_sigma_uN(motion, x_um, v_um_s)
+        noise_uN = math.hypot(seen_uN, self.model.residual_uN)
+        raw_uN = float(force_uN(self.model, x_um, v_um_s, adhesion=True))
+        if not self._touches and raw_uN > _TOUCH_SIGMAS * seen_uN:
+            self._touches = True
+            if self._touched_ns is None:
+                self._touched_ns = motion.begin_ns if motion.after_corner else motion.t_ns
+                x_um, v_um_s = self._compression(motion)
+                raw_uN = float(force_uN(self.model, x_um, v_um_s, adhesion=True))
+        elif raw_uN <= 0.0:
+            self._touches = False
+        if not self._touches:
+            if motion.position_um - self.model.contact_um < _AT_REST_UM:
+                self._touched_ns = None
+            return self._publish(frame, 0.0, noise_uN, motion.velocity_um_s, set())
+        flags = {OUTSIDE_RANGE} if self._is_outside(motion, x_um, v_um_s) else set()
+        sigma_uN = math.hypot(noise_uN, self._model_sigma_uN(x_um, v_um_s))
+        return self._publish(frame, max(raw_uN, 0.0), sigma_uN, motion.velocity_um_s, flags)
+
+    def _compression(self, motion: Motion) -> tuple[float, float]:
+        """Compression x of eq. (21), µm, and its rate, µm/s, by eq. (26)."""
+        x_um, v_um_s = motion.position_um - self.model.contact_um, motion.velocity_um_s
+        if self._touched_ns is None or self.model.slip_um == 0.0:
+            return x_um, v_um_s
+        since_s = (motion.t_ns - self._touched_ns) / NS_PER_S
+        return x_um - float(slipped_um(self.model, since_s)), v_um_s - float(slip_speed_um_s(self.model, since_s))
+
+    # ------------------------------------------------------------------ uncertainty
+
+    def _seen_sigma_uN(self, motion: Motion, x_um: float, v_um_s: float) -> float:
+        """Standard deviation from the noise of the deformation and of the velocity."""
+        damper = self.model.b_loading_uN_s_per_um if v_um_s > 0.0 else self.model.b_unloading_uN_s_per_um
+        from_velocity = damper * motion.velocity_sigma_um_s if damper else 0.0
+        from_position = float(stiffness_uN_per_um(self.model, x_um)) * motion.sigma_um
+        return math.hypot(from_position, from_velocity)
+
+    def _model_sigma_uN(self, x_um: float, v_um_s: float) -> float:
+        """Standard deviation from the parameters' covariance; that of the damper while it damps like in loading."""
+        if not self.model.covariance:
+            return 0.0
+        damped = v_um_s > 0.0 or self.model.b_unloading_uN_s_per_um == self.model.b_loading_uN_s_per_um
+        slope = (x_um, x_um**3, v_um_s if damped else 0.0)
+        terms = zip((p * q for p in slope for q in slope), self.model.covariance, strict=True)
+        return math.sqrt(max(sum(weight * value for weight, value in terms), 0.0))
+
+    def _is_outside(self, motion: Motion, x_um: float, v_um_s: float) -> bool:
+        deeper = x_um - _RANGE_SIGMAS * motion.sigma_um > self.model.deepest_um
+        return deeper or abs(v_um_s) - _RANGE_SIGMAS * motion.velocity_sigma_um_s > self.model.fastest_um_s
+
+    def _publish(
+        self, frame: DeformationSample, force_uN: float, sigma_uN: float, velocity_um_s: float, flags: set[str]
+    ) -> VisionForceSample:
+        seq, self._seq = self._seq, self._seq + 1
+        return VisionForceSample(
+            t_ns=frame.t_ns,
+            dt_ns=frame.dt_ns,
+            t_source="computed",
+            device=self.device,
+            seq=seq,
+            flags=frame.flags | flags,
+            force_uN=force_uN,
+            sigma_uN=sigma_uN,
+            deformation_um=frame.deformation_um,
+            velocity_um_s=velocity_um_s,
+        )

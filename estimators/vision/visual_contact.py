@@ -1,0 +1,167 @@
+"""When and where a tool touched a specimen, by the camera alone."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from microdrivers.core.contact_samples import DeformationSample
+from microdrivers.core.units import NS_PER_S, Range, check_range
+from microdrivers.estimators.vision.template import FloatArray
+
+_HISTORY = 120
+_REST_FRAMES = 5
+_REST_GAP = 5
+_BEGUN = 0.3
+_TOGETHER = 0.4
+_TOGETHER_SIGMAS = 4.0
+_MOVING_SIGMAS = 3.0
+_ROUNDS = 20
+
+
+class ContactEvent(NamedTuple):
+    """The first touch.
+
+    Attributes:
+        t_ns: when; sigma_s: standard deviation of it, the frames' own times not included. NaN if the tip stood still.
+        tip_um: where the tip was, in the samples' own coordinate; tip_sigma_um: standard deviation of it.
+        deformation_um: what the samples called the deformation before the touch; deformation_sigma_um: of it.
+        frame_seq: the first frame after the touch. frames: how many of them told the place.
+    """
+
+    t_ns: int
+    sigma_s: float
+    tip_um: float
+    tip_sigma_um: float
+    deformation_um: float
+    deformation_sigma_um: float
+    frame_seq: int
+    frames: int
+
+
+class VisualContact:
+    """Detects the touch while the tip comes nearer: the contact point, at rest until then, moves along with it.
+
+    A cumulative sum of the deformation against its mean at rest, in units of its own standard deviation, less
+    `slack` a frame (Page's test), raises the alarm. The place follows from the frames since the sum left zero:
+    deformation = max(0, tip − place). A specimen that moves without the tip, or otherwise than it, is no contact.
+
+    Args:
+        threshold: of the sum; with slack 1, white noise exceeds 12 once in 1e9 frames.
+        slack: deformation per frame, in standard deviations, that counts as none.
+        confirm_frames: frames after the touch, at least, from which the place is found; the event comes that late.
+        confirm_sigmas: deformation, in standard deviations, at least, at which it comes.
+
+    Attributes:
+        event: the touch; None before.
+    """
+
+    def __init__(
+        self,
+        *,
+        threshold: float = 12.0,
+        slack: float = 1.0,
+        confirm_frames: int = 6,
+        confirm_sigmas: float = 15.0,
+    ) -> None:
+        check_range(threshold, Range(1.0, 1e3), what="threshold", unit="(standard deviations)")
+        check_range(slack, Range(0.1, 10.0), what="slack", unit="(standard deviations)")
+        check_range(confirm_frames, Range(3, _HISTORY // 2), what="confirm_frames", unit="frames")
+        self._threshold = threshold
+        self._slack = slack
+        self._confirm_frames = confirm_frames
+        self._confirm_sigmas = confirm_sigmas
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything; the specimen rests undeformed again."""
+        self.event: ContactEvent | None = None
+        self._samples: deque[DeformationSample] = deque(maxlen=_HISTORY)
+        self._sum = 0.0
+        self._moving = 0
+
+    def update(self, sample: DeformationSample) -> ContactEvent | None:
+        """Take the next sample; returns the touch once, with the sample that confirms it."""
+        if self.event is not None or not sample.found or not math.isfinite(sample.tip_um):
+            return None
+        self._samples.append(sample)
+        resting = len(self._samples) - 1 - self._moving
+        if resting < _REST_FRAMES:
+            return None
+        rest, rest_sigma = self._rest(resting)
+        sigma = math.hypot(sample.sigma_um, rest_sigma)
+        self._sum = max(0.0, self._sum + (sample.deformation_um - rest) / sigma - self._slack)
+        self._moving = self._moving + 1 if self._sum > 0.0 else 0
+        if (
+            self._sum < self._threshold
+            or self._moving < self._confirm_frames
+            or sample.deformation_um - rest < self._confirm_sigmas * sigma
+        ):
+            return None
+        self.event = self._place(rest, rest_sigma)
+        if self.event is None:
+            self._samples.clear()
+            self._sum, self._moving = 0.0, 0
+        return self.event
+
+    def _rest(self, resting: int) -> tuple[float, float]:
+        """Mean deformation before the newest rise, and its standard deviation."""
+        count = max(_REST_FRAMES, resting - _REST_GAP)
+        values = np.array([self._samples[k].deformation_um for k in range(count)])
+        sigmas = np.array([self._samples[k].sigma_um for k in range(count)])
+        return float(values.mean()), float(np.sqrt(np.mean(sigmas**2) / count))
+
+    def _place(self, rest: float, rest_sigma: float) -> ContactEvent | None:
+        """The touch from the frames around it, or None if tip and specimen do not move as one."""
+        recent = [self._samples[k] for k in range(len(self._samples) - self._moving, len(self._samples))]
+        tip = np.array([sample.tip_um for sample in recent])
+        deformation = np.array([sample.deformation_um for sample in recent]) - rest
+        variance = np.array([sample.sigma_um**2 + sample.tip_sigma_um**2 for sample in recent])
+        begun = int(np.argmax(deformation > _BEGUN * deformation[-1]))
+        risen = float(deformation[-1] - deformation[begun])
+        excess = abs(float(tip[-1] - tip[begun]) - risen)
+        if excess > _TOGETHER * risen + _TOGETHER_SIGMAS * math.sqrt(variance[-1]):
+            return None
+        place = float((tip - deformation)[begun:].mean())
+        after = tip > place
+        for _ in range(_ROUNDS):
+            weights = after / variance
+            place = float((weights * (tip - deformation)).sum() / weights.sum())
+            if np.array_equal(after, tip > place) or not np.any(tip > place):
+                break
+            after = tip > place
+        first = int(np.argmax(after))
+        t_ns, sigma_s = _time(recent[first:], deformation[first:], rest_sigma)
+        return ContactEvent(
+            t_ns=t_ns,
+            sigma_s=sigma_s,
+            tip_um=place,
+            tip_sigma_um=math.hypot(1.0 / math.sqrt(float(weights.sum())), rest_sigma),
+            deformation_um=rest,
+            deformation_sigma_um=rest_sigma,
+            frame_seq=recent[first].frame_seq,
+            frames=int(after.sum()),
+        )
+
+
+def _time(touching: list[DeformationSample], deformation_um: FloatArray, rest_sigma_um: float) -> tuple[int, float]:
+    """Where a line through the first deformations after the touch meets zero, and its standard deviation in s."""
+    start_ns = touching[0].t_ns
+    t_s = np.array([(sample.t_ns - start_ns) / NS_PER_S for sample in touching])
+    sigma = np.array([sample.sigma_um for sample in touching])
+    if len(touching) < 3 or not np.ptp(t_s) > 0.0:
+        return start_ns, math.nan
+    design = np.stack([np.ones_like(t_s), t_s]) / sigma
+    covariance = np.linalg.inv(design @ design.T)
+    level, speed = (covariance @ design @ (deformation_um / sigma)).tolist()
+    if not speed > _MOVING_SIGMAS * math.sqrt(covariance[1, 1]):
+        return start_ns, math.nan
+    squares = float((((deformation_um - level - speed * t_s) / sigma) ** 2).sum())
+    covariance = covariance * max(1.0, squares / (len(touching) - 2))
+    before_s = -level / speed
+    gradient = np.array([1.0, before_s])
+    variance = float(gradient @ covariance @ gradient) + rest_sigma_um**2
+    return start_ns + round(before_s * NS_PER_S), math.sqrt(variance) / speed

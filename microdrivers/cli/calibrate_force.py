@@ -1,0 +1,194 @@
+"""`microdrivers calibrate force`."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.output import describe_rig, prepare_folder
+from microdrivers.cli.progress import TerminalProgress
+from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
+
+if TYPE_CHECKING:
+    from microdrivers.routines.force import Characterisation, IndentationSource
+
+_QUESTION = "Is the specimen held, the probe aligned with it, and nothing else in its way?"
+
+
+@click.command(short_help="A specimen's springs and damper; then force from the camera.")
+@click.option("--rig", "rig_file", type=click.Path(path_type=Path), help="Rig file; default: the emulated workstation.")
+@click.option("--fake", is_flag=True, help="Replace every connection of the rig file by its emulator.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
+@click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
+@click.option("--specimen", metavar="NAME", help="Preset of an emulated specimen; on hardware, a name for the result.")
+@click.option("--csv", "table", type=click.Path(path_type=Path), help="A recorded indentation instead of a rig.")
+@click.option("--calibration", type=click.Path(path_type=Path), help="result.json of `calibrate optics` for µm.")
+@click.option("--depth-um", type=float, default=110.0, show_default=True, help="How far to press.")
+@click.option("--max-force-uN", "max_force_uN", type=float, help="Where to turn back; default: 80 % of the limit.")
+@click.option("--speed-um-s", type=float, default=5.0, show_default=True, help="Of the probe, in and out.")
+@click.option("--hold-s", type=click.FloatRange(min=0.0), default=0.0, show_default=True, help="Wait when deepest.")
+@click.option("--check/--no-check", default=True, show_default=True, help="Press again, force from the camera alone.")
+@click.option("--yes", is_flag=True, help="Do not ask whether specimen and probe are ready.")
+@click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-force/.")
+@click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
+@click.option("--wire-log", type=click.Path(path_type=Path), metavar="FILE", help=WIRE_LOG_HELP)
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON instead of a summary.")
+def force(
+    rig_file: Path | None,
+    fake: bool,
+    seed: int,
+    world: Path | None,
+    specimen: str | None,
+    table: Path | None,
+    calibration: Path | None,
+    yes: bool,
+    check: bool,
+    out: Path | None,
+    real_time: bool,
+    wire_log: Path | None,
+    as_json: bool,
+    **press: Any,
+) -> None:
+    """Identify a held specimen's springs and damper with the force probe (Bilen et al., section III.C).
+
+    The probe tares, approaches slowly until contact, presses at constant speed to a depth or force, and returns;
+    the camera gives the deformation. F = m·a + b·v + k1·x + k2·x³ is then identified in the paper's four ways, and a
+    second indentation tells how well force is read from the camera alone. The rig file's force guard watches over it
+    all. Writes result.json, specimen.yaml, record.csv and report.html.
+
+    \b
+    Examples:
+      microdrivers calibrate force                                emulated workstation, world 0
+      microdrivers calibrate force --specimen slip_corrected      another emulated specimen
+      microdrivers calibrate force --rig lab.yaml --depth-um 60   hardware; asks before it moves
+      microdrivers calibrate force --rig lab.yaml --fake          the same rig, emulated
+      microdrivers calibrate force --csv indentation.csv          time_s, indentation_um, force_uN
+    """
+    from microdrivers.configs import shipped_rig
+
+    progress = TerminalProgress(quiet=as_json)
+    try:
+        if table is not None:
+            _refuse_rig_options(rig_file, fake, real_time, wire_log, calibration)
+            complete = _from_table(table, specimen, out, as_json, progress)
+        else:
+            emulated = fake or rig_file is None
+            if not emulated and not yes:
+                click.confirm(_QUESTION, abort=True, err=True)
+            overrides = {"specimen": {"preset": specimen}} if emulated and specimen is not None else None
+            choice = RigChoice(rig_file or shipped_rig(), emulated, seed, world, wire_log)
+            complete = _on_rig(
+                choice, specimen, overrides, calibration, press, check, out, real_time, as_json, progress
+            )
+    finally:
+        progress.close()
+    if not complete:
+        click.echo("interrupted: the probe was told to stop and taken away from the specimen", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _refuse_rig_options(
+    rig_file: Path | None, fake: bool, real_time: bool, wire_log: Path | None, calibration: Path | None
+) -> None:
+    from microdrivers.core.errors import ConfigError
+
+    if rig_file is not None or fake or real_time or wire_log is not None or calibration is not None:
+        raise ConfigError(
+            "--csv replaces the rig", remedy="leave out --rig, --fake, --real-time, --wire-log and --calibration"
+        )
+
+
+def _from_table(file: Path, specimen: str | None, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+    from microdrivers.recording.indentation_table import IndentationTable
+    from microdrivers.routines.force import IndentationPlayback
+
+    known = {"source": f"recorded indentation {file}", "clock": "recorded", "settings": {"specimen": specimen}}
+    return _run(IndentationPlayback(IndentationTable(file)), known, False, out, as_json, progress)
+
+
+def _on_rig(
+    choice: RigChoice,
+    specimen: str | None,
+    overrides: dict[str, Any] | None,
+    calibration: Path | None,
+    press: dict[str, Any],
+    check: bool,
+    out: Path | None,
+    real_time: bool,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> bool:
+    from microdrivers.core.clock import SimulatedClock, SystemClock
+    from microdrivers.rig import open_rig
+    from microdrivers.routines.force import PressExperiment, PressSettings, Sight
+
+    file, fake, seed, world, wire_log, _ = choice
+    clock = SimulatedClock() if fake and not real_time else SystemClock()
+    with open_rig(
+        file, fake=fake, seed=seed or 0, clock=clock, world=world, world_overrides=overrides, devices="probe",
+        wire_log=wire_log,
+    ) as rig:  # fmt: skip
+        settings = PressSettings(**press)
+        sight = Sight.calibrated(rig, calibration) if calibration is not None else Sight()
+        known = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict() | {"specimen": specimen})
+        return _run(PressExperiment(rig, settings, sight=sight), known, check, out, as_json, progress)
+
+
+def _run(
+    source: IndentationSource,
+    known: dict[str, Any],
+    check: bool,
+    out: Path | None,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> bool:
+    from microdrivers.core.clock import utc_now
+    from microdrivers.core.errors import MicrodriversError
+    from microdrivers.report.force_report import write_force_report
+    from microdrivers.report.force_summary import force_summary
+    from microdrivers.report.force_truth import ContactTruthCollector
+    from microdrivers.routines.force import Characterisation, build_result
+    from microdrivers.routines.provenance import describe_run
+
+    folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force")
+    truth = ContactTruthCollector(source.bus)
+    characterisation = Characterisation(source)
+    try:
+        run = characterisation.run(progress, check=check)
+    except MicrodriversError:
+        _keep(characterisation, folder)
+        raise
+    command = shlex.join(["microdrivers", *sys.argv[1:]])
+    result = build_result(run, describe_run(known, command=command, now=utc_now()))
+    result = result.model_copy(update={"truth": truth.compare(result, run.first.deformations)})
+    folder.mkdir(parents=True, exist_ok=True)
+    result.write_json(folder / "result.json")
+    result.write_specimen(folder / "specimen.yaml")
+    _keep(characterisation, folder, say=False)
+    progress.step("drawing the report")
+    write_force_report(result, folder / "report.html")
+    progress.close()
+    if as_json:
+        click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
+    else:
+        click.echo(force_summary(result))
+        click.echo(f"\nwritten to {folder}/: result.json, specimen.yaml, record.csv, report.html")
+    return run.complete
+
+
+def _keep(characterisation: Characterisation, folder: Path, *, say: bool = True) -> None:
+    """Write down what has been measured, also of an experiment that failed."""
+    from microdrivers.recording.indentation_table import write_indentation_table
+
+    if characterisation.first is None or not characterisation.first.samples:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "record.csv"
+    write_indentation_table(file, characterisation.first.samples)
+    if say:
+        click.echo(f"what was measured is in {file}; to analyse it: calibrate force --csv {file}", err=True)

@@ -1,0 +1,88 @@
+"""The terminal summary of a force characterisation: plain text, short enough to be seen at once."""
+
+from __future__ import annotations
+
+import textwrap
+
+from microdrivers.report.force_quantities import excluded_text, protocol_rows, slip_text, truth_rows
+from microdrivers.report.number_format import compact, significant
+from microdrivers.report.page import created, run_kind
+from microdrivers.results.force import ForceResult
+
+_WIDTH = 100
+
+
+def force_summary(result: ForceResult) -> str:
+    """What a characterisation found, in plain text; notes come last.
+
+    Values have the half-width of their 95 % interval; one that the record does not determine stands in brackets.
+    """
+    lines = [*_heading(result), "", *_protocols(result), "", *_performance(result)]
+    notes = [
+        line
+        for note in result.notes
+        for line in textwrap.wrap(note, _WIDTH, initial_indent="  ! ", subsequent_indent="    ")
+    ]
+    if notes:
+        lines += ["", *notes]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _heading(result: ForceResult) -> list[str]:
+    provenance, setup = result.provenance, result.setup
+    specimen = provenance.settings.get("specimen") or (result.truth.preset if result.truth is not None else "")
+    what = f"Force characterisation{f' of {specimen}' if specimen else ''}"
+    where = f", {provenance.rig_name}, {setup.sensor}" if provenance.rig_name else ""
+    state = "complete" if result.complete else "INTERRUPTED"
+    return [what + where, f"{run_kind(provenance).label}, {state}, {created(provenance)}"]
+
+
+def _protocols(result: ForceResult) -> list[str]:
+    rows = [["", "k1 (µN/µm)", "k2 (µN/µm³)", "b (µN·s/µm)", "error", "paper"]]
+    rows += [
+        [f"{'*' if row.best else ' '} {row.key}", row.k1, row.k2, row.b, row.error, row.paper[3]]
+        for row in protocol_rows(result)
+    ]
+    lines = _table(rows)
+    truth = truth_rows(result)
+    if truth:
+        lines += [
+            "",
+            *_table([["  truth of the simulation", "", ""], *([f"  {t.name}", t.truth, t.error] for t in truth)]),
+        ]
+    return lines
+
+
+def _table(rows: list[list[str]]) -> list[str]:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+
+
+def _performance(result: ForceResult) -> list[str]:
+    setup = result.setup
+    rows = [
+        ("Best", f"{result.best} (*); error is RMS(F − F̂)/RMS(F)"),
+        ("Pressed", f"{significant(setup.deepest_um, 4)} µm, {significant(setup.largest_force_uN, 4)} µN, "
+         f"{compact(setup.speed_um_s)} µm/s"),
+    ]  # fmt: skip
+    slip = slip_text(result)
+    if slip and result.best == "slip_corrected":
+        rows.append(("Slip", slip))
+    rows.append(("Misfit", result.misfit.text))
+    check = result.vision_check
+    if check is not None:
+        rows.append(
+            (
+                "Camera alone",
+                f"force within {significant(check.error_percent, 2)} % of the sensor's in a fresh indentation",
+            )
+        )
+    if result.largest_speed_um_s is not None:
+        rows.append(
+            ("Speed limit", f"{significant(result.largest_speed_um_s, 3)} µm/s keep below that force at that depth")
+        )
+    excluded = excluded_text(result)
+    if excluded:
+        rows.append(("Not used", f"samples: {excluded}"))
+    width = max(len(name) for name, _ in rows)
+    return [f"  {name.ljust(width)}  {text}" for name, text in rows]

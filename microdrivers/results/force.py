@@ -1,0 +1,234 @@
+"""The result of a force characterisation: `result.json` and `specimen.yaml`, schema version 1.
+
+Keys are stable: a key is never renamed or given another unit within a schema version. `None` stands where a figure
+is undefined; NaN is never written.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+import yaml
+
+from microdrivers.core.errors import ConfigError
+from microdrivers.results.record import Provenance, Record, Trace
+
+SCHEMA_VERSION = 1
+
+ProtocolName = Literal["single", "unloading_springs", "loading_only", "slip_corrected", "loading"]
+PROTOCOLS: tuple[ProtocolName, ...] = ("single", "unloading_springs", "loading_only", "slip_corrected", "loading")
+"""The paper's four ways to fit its model, section III.C, and the loading part alone."""
+
+
+class Contact(Record):
+    """Where and when the tool met the specimen, estimated together with the model.
+
+    `deformation_um` is where x = 0 lies in the deformation's own coordinate.
+    """
+
+    time_s: float
+    deformation_um: float
+    deformation_sigma_um: float | None
+
+
+class Identifiable(Record):
+    """Whether the record determines each parameter; `reasons` say why not."""
+
+    k1: bool
+    k2: bool
+    b: bool
+    m: bool
+    reasons: dict[str, str]
+
+
+class SlipFit(Record):
+    """Bilen et al., eq. (26): x*(t) = x(t) − offset·(1 − e^(−α·t)), t from the contact, as `slip_corrected` has it.
+
+    `not_returned_um` is the deformation that was left when contact was lost; None if it was not lost.
+    """
+
+    offset_um: float
+    offset_sigma_um: float | None
+    rate_per_s: float
+    rate_sigma_per_s: float | None
+    not_returned_um: float | None
+    identifiable: bool
+
+
+class ProtocolResult(Record):
+    """One way of fitting F = m·a + b·v + k1·x + k2·x³.
+
+    Attributes:
+        b_uN_s_per_um: while loading. b_unloading_uN_s_per_um: on the way back; 0 where the protocol says so.
+        m_kg: None where the record does not determine it: at constant speed it never does.
+        covariance: 3×3, of k1, k2, b in these units. sigma_*: standard deviations.
+        error_percent: 100·RMS(F − F̂)/RMS(F), over all samples of both branches (of loading alone for `loading`).
+        noise_residual_ratio: RMS residual over that which the noise of force and image alone would leave.
+        identifiable: per parameter; one that is not must not be used as a property of the specimen.
+    """
+
+    k1_uN_per_um: float
+    k1_sigma_uN_per_um: float | None
+    k2_uN_per_um3: float
+    k2_sigma_uN_per_um3: float | None
+    b_uN_s_per_um: float
+    b_sigma_uN_s_per_um: float | None
+    b_unloading_uN_s_per_um: float
+    m_kg: float | None
+    covariance: list[list[float]] | None
+    error_percent: float
+    noise_residual_ratio: float | None
+    condition_number: float | None
+    identifiable: Identifiable
+
+
+class Misfit(Record):
+    """A test of the residual's structure: is what the best fit leaves over noise, or an effect outside the model?"""
+
+    found: bool
+    statistic: float | None
+    p_value: float | None
+    text: str
+
+
+class VisionCheck(Record):
+    """A fresh indentation of the same specimen with the force from the camera alone, against the sensor."""
+
+    error_percent: float
+    largest_error_uN: float
+    samples: int
+    outside_range: int
+
+
+class ForceTraces(Record):
+    """One value a sample: what figures 9–11 are drawn from.
+
+    `branch` is approach, loading, hold, unloading or lost. `fitted_uN` by protocol; `check_*` of the fresh indentation.
+    """
+
+    time_s: list[float]
+    deformation_um: list[float]
+    force_uN: list[float]
+    branch: list[str]
+    fitted_uN: dict[str, Trace]
+    check_time_s: list[float]
+    check_force_uN: list[float]
+    check_vision_uN: Trace
+
+
+class ForceTruth(Record):
+    """What the simulation knows of the specimen, and the error of the best fit; percent of the truth."""
+
+    preset: str
+    k1_uN_per_um: float
+    k2_uN_per_um3: float
+    b_uN_s_per_um: float
+    b_unloading_uN_s_per_um: float
+    m_kg: float
+    slip_offset_um: float
+    slip_rate_per_s: float
+    outside_model: list[str]
+    errors_percent: dict[str, float]
+    vision_deformation_rms_um: float | None
+
+
+class Setup(Record):
+    """How the specimen was indented and seen.
+
+    `scale_source`: the probe's own travel, an optical calibration, or a recording that states µm.
+    """
+
+    sensor: str
+    stage: str | None
+    camera: str | None
+    scale_source: str
+    scale_px_per_um: float | None
+    scale_sigma_px_per_um: float | None
+    zoom: float | None
+    speed_um_s: float
+    deepest_um: float
+    largest_force_uN: float
+    tare_uN: float | None
+
+
+class ForceResult(Record):
+    """A force characterisation, Bilen et al., sections II.B and III.C.
+
+    Attributes:
+        complete: False if the run was interrupted; the estimates then come from what had been measured.
+        best: the protocol that suits the record best.
+        excluded_samples: reason → number of samples that no fit used.
+        vision_force_error_percent: 100·RMS(F − F̂)/RMS(F) of the fresh indentation; None if there was none.
+        largest_speed_um_s: keeps the predicted force below `setup.largest_force_uN` at the deepest point.
+    """
+
+    schema_version: Literal[1] = 1
+    kind: Literal["force-characterisation"] = "force-characterisation"
+    complete: bool
+    contact: Contact
+    protocols: dict[ProtocolName, ProtocolResult]
+    best: ProtocolName
+    slip: SlipFit | None
+    misfit: Misfit
+    vision_force_error_percent: float | None
+    vision_check: VisionCheck | None
+    largest_speed_um_s: float | None
+    excluded_samples: dict[str, int]
+    deformation_sigma_um: float
+    force_sigma_uN: float
+    setup: Setup
+    traces: ForceTraces
+    notes: list[str]
+    provenance: Provenance
+    truth: ForceTruth | None = None
+
+    def write_json(self, file: Path) -> None:
+        """Write `result.json`; keys in the order of this class."""
+        file.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+    def write_specimen(self, file: Path) -> None:
+        """Write `specimen.yaml`: what is needed to read force from the camera, and what it is valid for."""
+        best = self.protocols[self.best]
+        content = {
+            "schema_version": self.schema_version,
+            "kind": "specimen",
+            "protocol": self.best,
+            "k1_uN_per_um": best.k1_uN_per_um,
+            "k2_uN_per_um3": best.k2_uN_per_um3,
+            "b_uN_s_per_um": best.b_uN_s_per_um,
+            "b_unloading_uN_s_per_um": best.b_unloading_uN_s_per_um,
+            "m_kg": best.m_kg,
+            "covariance_of_k1_k2_b": best.covariance,
+            "slip": None if self.slip is None or self.best != "slip_corrected" else self.slip.model_dump(mode="json"),
+            "identifiable": best.identifiable.model_dump(mode="json"),
+            "misfit": self.misfit.found,
+            "valid_for": {
+                "deepest_um": self.setup.deepest_um,
+                "fastest_um_s": self.setup.speed_um_s,
+                "force_uN": self.setup.largest_force_uN,
+            },
+            "vision_force_error_percent": self.vision_force_error_percent,
+            "created_utc": self.provenance.created_utc,
+            "rig": self.provenance.rig_name,
+            "complete": self.complete,
+            "simulated": self.provenance.fake,
+        }
+        file.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+
+
+def read_force_result(file: Path) -> ForceResult:
+    """Read a `result.json`.
+
+    Raises:
+        ConfigError: it is not one, or of another schema version.
+    """
+    try:
+        return ForceResult.model_validate(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, pydantic.ValidationError) as error:
+        raise ConfigError(
+            f"not a result of a force characterisation of schema version {SCHEMA_VERSION}: {error}",
+            file=str(file), remedy="give the result.json of `microdrivers calibrate force`",
+        ) from error  # fmt: skip

@@ -1,0 +1,135 @@
+"""The force data without which a guarded stage does not move."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import Any
+
+from microdrivers.core.clock import Clock, ClockError
+from microdrivers.core.errors import MicrodriversError, UnsafeError
+from microdrivers.core.units import NS_PER_MS, NS_PER_S
+from microdrivers.devices.base import Device
+from microdrivers.devices.force_sensor import ForceSensor
+
+_FIRST_READING_S = 0.5
+_WITHOUT_FORCE = "stop() and retract() work all the same"
+
+
+class ForceFlow:
+    """Opens a sensor and its stream when a guarded stage is first to move, keeps it, and knows how old its data are.
+
+    Args:
+        sensor: its name.
+        devices: of the rig; the sensor may be missing among them.
+        clock: of the rig.
+        stale_after_ns: readings that are older are no use.
+        on_beat: called several times in that time while the stream is kept.
+    """
+
+    def __init__(
+        self, sensor: str, devices: Mapping[str, Device[Any]], *, clock: Clock, stale_after_ns: int,
+        on_beat: Callable[[], object],
+    ) -> None:  # fmt: skip
+        self._name = sensor
+        self._devices = devices
+        self._clock = clock
+        self._stale_after_ns = stale_after_ns
+        self._on_beat = on_beat
+        self._kept: ExitStack | None = None
+        self._beginning = threading.RLock()
+        self._heard_ns = -NS_PER_S
+        self._why_not = ""
+        self._awaited = False
+        self._arrived = clock.event()
+
+    # ------------------------------------------------------------------ what comes
+
+    def heard(self, t_ns: int) -> None:
+        """A reading of that instant has come."""
+        self._heard_ns = min(t_ns, self._clock.now_ns())
+        self._why_not = ""
+        if self._awaited:
+            self._arrived.set()
+
+    def invalid(self, why: str) -> None:
+        """A reading has come that tells no force."""
+        self._why_not = why
+
+    @property
+    def complaint(self) -> str:
+        """What is wrong with the data now; empty if they are valid and fresh."""
+        if self._why_not:
+            return f"{self._name} says {self._why_not}"
+        age_ns = self._clock.now_ns() - self._heard_ns
+        if age_ns <= self._stale_after_ns:
+            return ""
+        age = f" for {age_ns / NS_PER_MS:.0f} ms" if self._heard_ns >= 0 else ""
+        return f"no reading has come from {self._name}{age}"
+
+    # ------------------------------------------------------------------ seeing to it that it comes
+
+    def require(self, stage: str) -> None:
+        """Let a stage move only if valid, fresh readings come; starts the sensor's stream if need be.
+
+        Raises:
+            UnsafeError: none come.
+        """
+        sensor = self._devices.get(self._name)
+        if not isinstance(sensor, ForceSensor):
+            raise UnsafeError(
+                f"{stage} moves only while {self._name} is read, which is not among the devices that this rig was "
+                "built with",
+                device=stage,
+                remedy=f"open the rig with {self._name} as well; {_WITHOUT_FORCE}",
+            )
+        with self._beginning:
+            self._keep_streaming(sensor, stage)
+            if self.complaint:
+                self._await_reading()
+        if self.complaint:
+            raise UnsafeError(
+                f"{stage} moves only while valid forces come: {self.complaint}",
+                device=stage,
+                remedy=f"check {self._name}, its cable and its amplifier; {_WITHOUT_FORCE}. To move without, take "
+                "the guard out of the rig file's safety section",
+            )
+
+    def close(self) -> None:
+        """Keep the stream no longer; idempotent."""
+        kept, self._kept = self._kept, None
+        if kept is not None:
+            kept.close()
+
+    def _keep_streaming(self, sensor: ForceSensor, stage: str) -> None:
+        if self._kept is not None and sensor.streaming and sensor.link != "closed":
+            return
+        self.close()
+        try:
+            if sensor.link != "lost":
+                sensor.open()
+            with ExitStack() as begun:
+                begun.enter_context(sensor.stream(sensor.stream_rate_hz))
+                period_s = self._stale_after_ns / 5 / NS_PER_S
+                begun.callback(self._clock.every(period_s, self._on_beat, name=f"{self._name} guard").cancel)
+                self._kept = begun.pop_all()
+        except MicrodriversError as error:
+            raise UnsafeError(
+                f"{stage} moves only while {self._name} is read, which does not work: {error.what}",
+                device=stage,
+                remedy=f"{error.remedy or f'check {self._name}'}; {_WITHOUT_FORCE}",
+            ) from error
+
+    def _await_reading(self) -> None:
+        deadline_ns = self._clock.now_ns() + round(_FIRST_READING_S * NS_PER_S)
+        self._awaited = True
+        try:
+            while self.complaint and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
+                self._arrived.clear()
+                if not self._arrived.wait(left_ns / NS_PER_S):
+                    break
+        except ClockError:
+            pass  # a callback on a simulated clock cannot wait for what comes later
+        finally:
+            self._awaited = False

@@ -1,0 +1,329 @@
+"""The force guard of one tool: stops what moves, and takes the tool away, when it presses too hard."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from microdrivers.core.clock import Clock
+from microdrivers.core.errors import ErrorTree, MicrodriversError, UnsafeError
+from microdrivers.core.samples import ForceSample
+from microdrivers.core.units import NS_PER_MS
+from microdrivers.devices.base import Device
+from microdrivers.devices.fine_stage import FineStage
+from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, STALE
+from microdrivers.devices.motion_plan import MotionPlan
+from microdrivers.devices.stage import Stage
+from microdrivers.rig.safety_force_flow import ForceFlow
+from microdrivers.rig.safety_retraction import Retraction
+from microdrivers.rig.safety_section import ForceGuardSettings
+
+BY = "force guard"
+"""Who has stopped a stage, in its events and errors."""
+
+LIMIT_RULE, DATA_RULE, TARE_RULE, RETRACTION_RULE = "force limit", "force data", "tare", "retraction"
+
+_NO_FORCE = frozenset({DISCONNECTED, STALE})
+_BELOW_SHARE = 0.95
+"""Of the limit: a trip is over below it, so that noise at the limit is not a trip a reading."""
+
+_WORSE_SHARE = 0.1
+"""Of the limit: a retraction that adds as much leads the wrong way, or tears at something."""
+
+_AGAIN_NS = 20 * NS_PER_MS
+_LIMIT_REMEDY = (
+    "look at what the tool touches. Moves are refused until the force is back below the limit and the tool has been "
+    "taken away; stop() and retract() are not"
+)
+_DATA_REMEDY = "check the force sensor, its cable and its amplifier; stop() and retract() work all the same"
+
+
+class Tell(Protocol):
+    """Where interventions go: to the bus and the log."""
+
+    def __call__(
+        self, rule: str, reason: str, *, stage: str, sensor: str = "", value: float = math.nan,
+        limit: float = math.nan, failed: bool = False,
+    ) -> None:  # fmt: skip
+        """Publish and log one."""
+
+
+class ForceGuard:
+    """One entry of `force_guards`. `take` is called with each reading before anybody else sees it.
+
+    What is judged is the raw force less the tare, but a tare counts only as far as a zero can be off: what goes beyond
+    `zero_uN` is load, so that no tare under load defeats the limit. A saturated reading is over any limit.
+
+    A trip stops the guarded stage, then every other stage that may be moving; the tool is then retracted, if a move of
+    its stage has been allowed since the rig was opened: before that it may be in somebody's hands.
+
+    Args:
+        settings: of the guard.
+        devices: of the rig, some may be missing.
+        clock: of the rig.
+        tell: told of each intervention, after it.
+
+    Attributes:
+        tripped: why, from a trip until the force is back below the limit and the retraction has ended; else empty.
+    """
+
+    def __init__(
+        self, settings: ForceGuardSettings, devices: Mapping[str, Device[Any]], *, clock: Clock, tell: Tell
+    ) -> None:
+        self.settings = settings
+        self.tripped = ""
+        self._devices = devices
+        self._clock = clock
+        self._tell = tell
+        self._lock = threading.Lock()
+        self._stale_ns = round(settings.stale_after_ms * NS_PER_MS)
+        self._flow = ForceFlow(settings.sensor, devices, clock=clock, stale_after_ns=self._stale_ns, on_beat=self._beat)
+        self._retraction = Retraction(self._the_stage, clock=clock, ended=self._retraction_ended)
+        self._armed = False
+        self._allowed = False
+        self._blind = False
+        self._unstopped = False
+        self._stopped_ns = -_AGAIN_NS
+        self._least_uN = math.inf
+        self._doubted_tare_uN = 0.0
+
+    # ------------------------------------------------------------------ what the rig asks
+
+    @property
+    def retraction(self) -> Retraction:
+        """Of this guard's tool."""
+        return self._retraction
+
+    @property
+    def _stage(self) -> FineStage | None:
+        stage = self._devices.get(self.settings.stage)
+        return stage if isinstance(stage, FineStage) else None
+
+    def _the_stage(self) -> FineStage:
+        stage = self._stage
+        assert stage is not None, "nothing is retracted that is not in the rig"
+        return stage
+
+    def allow(self, plan: MotionPlan) -> None:
+        """Let the guarded stage begin to move, or to search its references.
+
+        Raises:
+            UnsafeError: no valid, fresh force data come.
+        """
+        if plan.kind == "retraction":
+            return
+        self._flow.require(self.settings.stage)
+        self._armed = self._allowed = True
+        self._blind = False
+        if self._flow.complaint:  # since it was looked at
+            self._allowed = False
+            self._flow.require(self.settings.stage)
+            self._allowed = True
+
+    def begin(self) -> None:
+        """Have force data come, without moving anything.
+
+        Raises:
+            UnsafeError: none come.
+        """
+        self._flow.require(self.settings.stage)
+
+    def rehearse(self) -> int:
+        """Be handed a force over the limit, as a rehearsal: ns until the stop command has been handed to the line.
+
+        The stage must be at rest. It is told to stop and nothing else: this is no trip.
+
+        Raises:
+            LinkError: the stop could not be sent.
+        """
+        start_ns = self._clock.now_ns()
+        excess_uN = 2.0 * self.settings.max_force_uN
+        sample = ForceSample(t_ns=start_ns, device=self.settings.sensor, force_uN=excess_uN, raw_uN=excess_uN)
+        if self._is_over(self._judged_uN(sample)):
+            self._the_stage().stop(by=BY, reason="rehearsal")
+        return self._clock.now_ns() - start_ns
+
+    def disarm(self) -> None:
+        """Nothing is retracted any more."""
+        self._retraction.disarm()
+
+    def close(self) -> None:
+        """End stream and retraction."""
+        self._retraction.close()
+        self._flow.close()
+
+    # ------------------------------------------------------------------ readings
+
+    def take(self, sample: ForceSample) -> None:
+        """Judge a reading, and stop at once if it demands that; in the publisher's thread."""
+        force_uN = self._judged_uN(sample)
+        if abs(sample.tare_uN) > self.settings.zero_uN and sample.tare_uN != self._doubted_tare_uN:
+            self._doubt_tare(sample.tare_uN)
+        if math.isnan(force_uN):
+            self._flow.invalid(", ".join(sorted(sample.flags & _NO_FORCE)) or "no number")
+            self._hold_while_blind()
+            return
+        self._flow.heard(sample.t_ns)
+        if self._is_over(force_uN):
+            self._hold_over_limit(force_uN)
+        elif self.tripped and abs(force_uN) <= _BELOW_SHARE * self.settings.max_force_uN:
+            self._end_trip()
+
+    def _judged_uN(self, sample: ForceSample) -> float:
+        """The force that counts; infinite if it is beyond the sensor's range, NaN if it is not known."""
+        if sample.flags & _NO_FORCE:
+            return math.nan
+        if SATURATED in sample.flags:
+            return math.inf
+        zero_uN = self.settings.zero_uN
+        return sample.raw_uN - min(max(sample.tare_uN, -zero_uN), zero_uN)
+
+    def _is_over(self, force_uN: float) -> bool:
+        return abs(force_uN) > self.settings.max_force_uN
+
+    # ------------------------------------------------------------------ too much force
+
+    def _hold_over_limit(self, force_uN: float) -> None:
+        stage, reason = self._stage, self._excess(force_uN)
+        with self._lock:
+            is_new, self.tripped = not self.tripped, self.tripped or reason
+        retracting = self._retraction.active or (stage is not None and stage.retracting)
+        if is_new:
+            self._least_uN = math.inf
+        if retracting:
+            self._watch_retraction(stage, force_uN)
+        elif is_new:
+            self._trip(reason, force_uN, retract=self._armed and stage is not None)
+        else:
+            moving = [each for each in self._stages_to_stop() if each.may_be_moving or self._unstopped]
+            self._stop_again(moving, reason, _LIMIT_REMEDY)
+
+    def _trip(self, reason: str, force_uN: float, *, retract: bool) -> None:
+        failures = self._stop(self._stages_to_stop(), reason, _LIMIT_REMEDY)
+        what = f"{reason}; {'stopped, and the tool is taken away' if retract else 'stopped'}"
+        self._told(LIMIT_RULE, what, value=force_uN, failures=failures)
+
+    def _stages_to_stop(self) -> list[Stage[Any]]:
+        """The guarded stage first; whatever else moves may be what presses."""
+        own = self._stage
+        others = [
+            device
+            for device in self._devices.values()
+            if isinstance(device, Stage) and device is not own and device.may_be_moving
+        ]
+        return [*([own] if own is not None else []), *others]
+
+    def _watch_retraction(self, stage: FineStage | None, force_uN: float) -> None:
+        """Stop a retraction that makes it worse; from then on only a person knows what to do."""
+        if stage is None or not stage.retracting or stage.being_commanded:
+            return  # it has not begun, and what was stopped may still brake
+        self._least_uN = min(self._least_uN, abs(force_uN))
+        if not abs(force_uN) > self._least_uN + _WORSE_SHARE * self.settings.max_force_uN:
+            return
+        self._least_uN = math.inf
+        reason = f"retracting raises the force: {self._excess(force_uN)}"
+        remedy = "free the tool by hand, and check retract_um of the stage in the rig file: it leads the wrong way"
+        failures = self._stop([stage], reason, remedy)
+        self._told(RETRACTION_RULE, f"{reason}; stopped", value=force_uN, failures=failures)
+
+    def _end_trip(self) -> None:
+        with self._lock:
+            if not self._retraction.active:
+                self.tripped = ""
+
+    def _retraction_ended(self, what: str, succeeded: bool) -> None:
+        remedy = "" if succeeded else "; the tool may still press: retract() it, or free it by hand"
+        self._told(RETRACTION_RULE, f"{what}{remedy}", failed=not succeeded)
+
+    def _excess(self, force_uN: float) -> str:
+        name, limit_uN = self.settings.sensor, self.settings.max_force_uN
+        if math.isinf(force_uN):
+            return f"{name} is saturated, so the force is over the limit of {limit_uN:g} µN"
+        return f"{name} feels {force_uN:.5g} µN, over the limit of {limit_uN:g} µN"
+
+    def _doubt_tare(self, tare_uN: float) -> None:
+        self._doubted_tare_uN = tare_uN
+        what = (
+            f"the tare of {self.settings.sensor}, {tare_uN:.5g} µN, is more than a zero may be off: all beyond "
+            f"{self.settings.zero_uN:g} µN counts as load. Free the tip and tare again; if it was free, state "
+            "zero_within_uN in the rig file"
+        )
+        self._told(TARE_RULE, what, value=tare_uN, limit=self.settings.zero_uN)
+
+    # ------------------------------------------------------------------ too little data
+
+    def _beat(self) -> None:
+        """Look at the age of the data while the stage moves."""
+        stage = self._stage
+        if stage is None or not stage.may_be_moving:
+            self._allowed = False
+        elif self._flow.complaint:
+            self._hold_while_blind()
+
+    def _hold_while_blind(self) -> None:
+        stage = self._stage
+        if not self._allowed or stage is None or stage.retracting or self._retraction.active:
+            return
+        if not (stage.may_be_moving or self._unstopped):
+            return
+        reason = self._flow.complaint or "the force is not known"
+        if self._blind:
+            self._stop_again([stage], reason, _DATA_REMEDY)
+            return
+        self._blind = True
+        failures = self._stop([stage], reason, _DATA_REMEDY)
+        self._told(DATA_RULE, f"{reason}; stopped", limit=self.settings.stale_after_ms, failures=failures)
+
+    # ------------------------------------------------------------------ stopping and telling
+
+    def _stop(self, stages: Sequence[Stage[Any]], reason: str, remedy: str) -> list[MicrodriversError]:
+        """Tell all to stop, whatever becomes of one of them."""
+        self._stopped_ns = self._clock.now_ns()
+        failures: list[MicrodriversError] = []
+        for stage in stages:
+            try:
+                stage.stop(by=BY, reason=reason, remedy=remedy)
+            except MicrodriversError as error:
+                failures.append(error)
+        self._unstopped = bool(failures)
+        return failures
+
+    def _stop_again(self, stages: Sequence[Stage[Any]], reason: str, remedy: str) -> None:
+        """Tell those again that were being commanded, or could not be reached; this is one intervention."""
+        if stages and self._clock.now_ns() - self._stopped_ns >= _AGAIN_NS:
+            self._stop(stages, reason, remedy)
+
+    def _told(
+        self, rule: str, what: str, *, value: float = math.nan, limit: float | None = None, failed: bool = False,
+        failures: Sequence[MicrodriversError] = (),
+    ) -> None:  # fmt: skip
+        own = self.settings
+        if failures:
+            what = f"{what}; NOT STOPPED: {'; '.join(str(error) for error in failures)}"
+        self._tell(
+            rule, what, stage=own.stage, sensor=own.sensor, value=value,
+            limit=own.max_force_uN if limit is None else limit, failed=failed or bool(failures),
+        )  # fmt: skip
+        if failures:
+            self._surface(ErrorTree(f"the {BY} could not stop every stage:", failures, remedy="use the emergency stop"))
+
+    def _surface(self, error: MicrodriversError) -> None:
+        """Have the main program see it in its next wait; the publisher goes on."""
+
+        def raise_it() -> None:
+            raise error
+
+        self._clock.call_at(self._clock.now_ns(), raise_it, name=BY)
+
+
+def refuse_while_tripped(guards: Sequence[ForceGuard], plan: MotionPlan) -> None:
+    """Let only retractions pass while a tool presses too hard: any stage may be what presses.
+
+    Raises:
+        UnsafeError: one does.
+    """
+    for guard in guards:
+        if guard.tripped and plan.kind != "retraction":
+            raise UnsafeError(f"refused by the {BY}: {guard.tripped}", remedy=_LIMIT_REMEDY)

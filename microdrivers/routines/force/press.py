@@ -1,0 +1,351 @@
+"""The live experiment: find the specimen with the probe, then press on it at constant speed and come back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import NamedTuple
+
+from microdrivers.core.contact_samples import DeformationSample
+from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced, OutOfRange, TargetLost
+from microdrivers.core.samples import ForceSample, Frame
+from microdrivers.core.units import Range, check_range
+from microdrivers.devices.camera import Camera
+from microdrivers.devices.fine_stage import FineStage
+from microdrivers.devices.force_sensor import ForceSensor
+from microdrivers.devices.zoom_motor import ZoomMotor
+from microdrivers.rig import Rig
+from microdrivers.routines.force.sight import Sight
+from microdrivers.routines.force.source import FrameTracker, IndentationNames, IndentationSetup
+from microdrivers.routines.force.way import ProbingWay
+from microdrivers.routines.progress import Progress
+
+SPEEDS_UM_S = Range(0.1, 100.0)
+DEPTHS_UM = Range(5.0, 1000.0)
+_LOOK_S = 0.05
+_AFTER_S = 0.5
+_SHARE_OF_LIMIT = 0.8
+"""Of the guard's limit, or of the sensor's range: where pressing ends by itself, before the guard must act."""
+_CONTACT_SIGMAS = 8.0
+_LEAST_CONTACT_UN = 1.0
+_CONTACT_READINGS = 3
+_LOST_FRAMES = 15
+_REST_FRAMES = 10
+
+
+class PressSettings(NamedTuple):
+    """The experiment's figures; the speed is the paper's.
+
+    Attributes:
+        depth_um: how far to press beyond the contact. max_force_uN: where pressing ends before that; None: 80 % of the
+            guard's limit or, without a guard, of the sensor's range.
+        hold_s: how long to stay at the deepest point.
+        free_travel_um: how far the probe travels in sight, touching nothing, to measure the scale; in `free_steps`.
+        most_approach_um: how far to look for the specimen beyond the starting point.
+        back_off_um: how far before the contact an indentation begins. rest_s: how long the specimen may recover.
+    """
+
+    speed_um_s: float = 5.0
+    depth_um: float = 110.0
+    max_force_uN: float | None = None
+    hold_s: float = 0.0
+    tare_s: float = 0.5
+    free_travel_um: float = 160.0
+    free_steps: int = 8
+    free_speed_um_s: float = 200.0
+    most_approach_um: float = 200.0
+    back_off_um: float = 15.0
+    rest_s: float = 5.0
+
+
+class PressExperiment:
+    """Presses the rig's probe on the specimen before it; see `PressSettings`."""
+
+    repeatable = True
+
+    def __init__(self, rig: Rig, settings: PressSettings | None = None, *, sight: Sight | None = None) -> None:
+        section = rig.file.probe
+        if section is None:
+            raise ConfigError(
+                "the rig file has no probe section, which a force characterisation needs",
+                file=str(rig.description.file),
+                remedy="add a probe section: stage, force, camera, ready_um",
+            )
+        self.settings = settings or PressSettings()
+        self.bus = rig.bus
+        self.clock = rig.clock
+        self.names = IndentationNames(section.force, f"{section.camera}/deformation", section.camera)
+        self._rig = rig
+        self._section = section
+        self._stage = rig.device(section.stage, FineStage)
+        self._sensor = rig.device(section.force, ForceSensor)
+        self._camera = rig.device(section.camera, Camera)
+        self._sight = sight or Sight()
+        self._limit_uN = self._force_limit_uN()
+        self._way: ProbingWay | None = None
+        self._contact_um = math.nan
+        self._touched = False
+        self._check_settings()
+
+    def _check_settings(self) -> None:
+        asked = self.settings
+        check_range(asked.speed_um_s, SPEEDS_UM_S, what="speed of the probe", unit="µm/s")
+        check_range(asked.depth_um, DEPTHS_UM, what="depth of the indentation", unit="µm")
+
+    def _force_limit_uN(self) -> float:
+        ceiling = min(abs(self._sensor.range_uN.min), abs(self._sensor.range_uN.max))
+        guard = self._rig.safety.limit_uN(self._sensor.name)
+        if guard is not None:
+            ceiling = min(ceiling, guard)
+        asked = self.settings.max_force_uN
+        if asked is None:
+            return _SHARE_OF_LIMIT * ceiling
+        if not 0.0 < asked < ceiling:
+            what = "the guard's limit" if ceiling == guard else "the sensor's range"
+            raise OutOfRange(
+                f"a largest force of {asked:g} µN is not between 0 and {what}, {ceiling:g} µN",
+                remedy="press less, or change the safety section of the rig file",
+            )
+        return asked
+
+    # ------------------------------------------------------------------ before the indentation
+
+    def prepare(self, progress: Progress) -> FrameTracker:
+        """Bring the probe up, tare, measure the scale, find the specimen, and choose what is tracked."""
+        self._require_referenced(progress)
+        if self._section.ready_um is not None:
+            x_um, y_um, z_um = self._section.ready_um
+            progress.step(f"probe to its place before the specimen, ({x_um:g}, {y_um:g}, {z_um:g}) µm")
+            self._stage.move_to(x_um=x_um, y_um=y_um, z_um=z_um, speed_um_s=self.settings.free_speed_um_s)
+        self._way = way = ProbingWay(self._stage, self._sensor, self._stage.read().position)
+        progress.step("tare: the probe touches nothing")
+        self._sensor.tare(self.settings.tare_s)
+        self._travel_in_sight(way, progress)
+        progress.step("approach until contact")
+        self._contact_um = self._approach(way)
+        self._touched = True
+        progress.step(f"contact after {self._contact_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
+        self._go(way, self._contact_um - self.settings.back_off_um, self.settings.free_speed_um_s)
+        self.clock.sleep(self.settings.rest_s)
+        rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
+        ahead_um = self._contact_um - way.place_um(self._stage.read().position)
+        tracker = self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um)
+        self._sensor.tare(self.settings.tare_s)
+        return tracker
+
+    def _require_referenced(self, progress: Progress) -> None:
+        unknown = [axis for axis in self._stage.reference_order if not self._stage.referenced[axis]]
+        if unknown and self._rig.fake:
+            progress.step(f"referencing {', '.join(unknown)} (emulated stage)")
+            self._stage.reference(unknown)
+        elif unknown:
+            raise NotReferenced(
+                f"the reference of axis {', '.join(unknown)} is not known; a characterisation never references by "
+                "itself",
+                device=self._stage.name,
+                remedy=f"take the probe away from the specimen, then: microdrivers reference "
+                f"{self._rig.description.file} {self._stage.name}",
+            )
+
+    def _travel_in_sight(self, way: ProbingWay, progress: Progress) -> None:
+        """Back and forth in free space, with a frame at rest at each step: what moves is the probe."""
+        steps, travel_um = self.settings.free_steps, self.settings.free_travel_um
+        progress.step(f"the probe's travel in sight, {travel_um:g} µm")
+        frames: list[Frame] = []
+        places_um: list[float] = []
+        for step in range(steps + 1):
+            self._go(way, -travel_um * (1.0 - step / steps), self.settings.free_speed_um_s)
+            places_um.append(way.place_um(self._stage.read().position))
+            frames.append(self._camera.grab())
+            progress.count(step + 1, steps + 1)
+        self._sight.learn(frames, places_um, scale_hint_px_per_um=self._expected_scale_px_per_um())
+
+    def _expected_scale_px_per_um(self) -> float:
+        """What objective, adapter, zoom and pixel pitch let expect."""
+        microscope, zoom = self._rig.file.microscope, self._zoom()
+        lens = 1.0 if microscope is None else microscope.objective * microscope.adapter
+        return lens * (zoom or 1.0) / (self._camera.pixel_pitch_um * self._camera.settings.binning)
+
+    def _approach(self, way: ProbingWay) -> float:
+        """Go on until the sensor feels the specimen; returns where that was."""
+        tare = self._sensor.tared
+        threshold_uN = max(_LEAST_CONTACT_UN, _CONTACT_SIGMAS * (tare.sigma_uN if tare is not None else 0.0))
+        felt = _Felt(threshold_uN, _CONTACT_READINGS)
+        end_um = min(self.settings.most_approach_um, way.longest_um() - self.settings.depth_um)
+        if end_um <= 0.0:
+            raise OutOfRange(
+                f"the stage's travel ends {way.longest_um():.0f} µm ahead, and {self.settings.depth_um:g} µm are to "
+                "be pressed",
+                device=self._stage.name,
+                remedy="start nearer to the middle of the travel, or press less deep",
+            )
+        with self._readings(felt):
+            reached = self._run(way, end_um, lambda: felt.enough)
+        if not felt.enough:
+            raise NoContact(
+                f"no contact within {end_um:.0f} µm: the force stayed within ±{threshold_uN:.2g} µN",
+                device=self._sensor.name,
+                remedy="align the probe with the specimen, nearer to it; check the sensor's axis in the rig file",
+                moved="yes",
+            )
+        if felt.force_uN < 0.0:
+            raise ConfigError(
+                f"{self._sensor.name} read {felt.force_uN:.3g} µN on contact, which must be positive",
+                remedy="turn its axis round in the rig file, or take the probe out of what it sticks to",
+            )
+        return reached
+
+    # ------------------------------------------------------------------ one indentation
+
+    def indent(self, begin: Callable[[], None], progress: Progress) -> None:
+        """Press to the depth or to the force limit, and come back at the same speed."""
+        assert self._way is not None
+        way, asked = self._way, self.settings
+        start_um, end_um = self._contact_um - asked.back_off_um, self._contact_um + asked.depth_um
+        self._go(way, start_um, asked.free_speed_um_s)
+        progress.step(f"pressing at {asked.speed_um_s:g} µm/s, to {asked.depth_um:g} µm or {self._limit_uN:.0f} µN")
+        felt, lost = _Felt(self._limit_uN, 1), _Lost()
+        total = round(2.0 * (end_um - start_um))
+
+        def show(place_um: float, *, back: bool) -> None:
+            done = place_um - start_um
+            progress.count(min(max(round(total - done if back else done), 0), total), total)
+
+        with ExitStack() as open_streams:
+            open_streams.enter_context(self._readings(felt))
+            open_streams.enter_context(self._frames(lost))
+            begin()
+            self.clock.sleep(_AFTER_S)
+            self._run(way, end_um, lambda: felt.enough or lost.too_long, lambda um: show(um, back=False))
+            lost.raise_if_too_long(self._camera.name)
+            if asked.hold_s:
+                self.clock.sleep(asked.hold_s)
+            self._run(way, start_um, lambda: lost.too_long, lambda um: show(um, back=True))
+            lost.raise_if_too_long(self._camera.name)
+            self.clock.sleep(_AFTER_S)
+
+    def _go(self, way: ProbingWay, place_um: float, speed_um_s: float) -> None:
+        self._stage.move_to(**way.targets(place_um), speed_um_s=way.path_speed_um_s(speed_um_s))
+
+    def _run(
+        self,
+        way: ProbingWay,
+        place_um: float,
+        enough: Callable[[], bool],
+        show: Callable[[float], None] = lambda _um: None,
+    ) -> float:
+        """Move at the experiment's speed until the place, or until enough; returns where the stage then stands."""
+        move = self._stage.start_move_to(
+            **way.targets(place_um), speed_um_s=way.path_speed_um_s(self.settings.speed_um_s)
+        )
+        told: list[bool] = []
+
+        def stop_once(_sample: ForceSample) -> None:
+            if enough() and not told:
+                told.append(True)
+                self._stage.stop(by="experiment", reason="far enough")
+
+        watch = self.bus.topic(self._sensor.name, ForceSample).subscribe(stop_once)
+        seen = self._stage.topic.subscribe(lambda pose: show(way.place_um(pose.position)))
+        try:
+            move.wait()
+        except MoveCancelled:
+            if not told:
+                raise
+            self._rest()
+        finally:
+            watch.cancel()
+            seen.cancel()
+        return way.place_um(self._stage.read().position)
+
+    def _rest(self) -> None:
+        """Wait until a stopped stage stands."""
+        while self._stage.read().moving:
+            self.clock.sleep(_LOOK_S)
+
+    @contextmanager
+    def _readings(self, felt: _Felt) -> Iterator[None]:
+        subscription = self.bus.topic(self._sensor.name, ForceSample).subscribe(felt.take)
+        try:
+            with self._sensor.stream(self._sensor.stream_rate_hz):
+                yield
+        finally:
+            subscription.cancel()
+
+    @contextmanager
+    def _frames(self, lost: _Lost) -> Iterator[None]:
+        subscription = self.bus.topic(self.names.deformation, DeformationSample).subscribe(lost.take)
+        try:
+            with self._camera.stream(self._camera.settings.rate_hz):
+                yield
+        finally:
+            subscription.cancel()
+
+    # ------------------------------------------------------------------ afterwards
+
+    def finish(self) -> None:
+        """Stop, and take the probe away if it has touched something."""
+        self._stage.stop(by="characterisation", reason="the experiment ended")
+        if self._touched and self._stage.link == "open" and self._stage.retract_um is not None:
+            self._rest()
+            self._stage.retract().wait()
+            self._touched = False
+
+    def setup(self) -> IndentationSetup:
+        """Names, speed, scale and zoom."""
+        tare = self._sensor.tared
+        return IndentationSetup(
+            sensor=self._sensor.name, stage=self._stage.name, camera=self._camera.name,
+            scale_source=self._sight.source, scale_px_per_um=self._sight.scale_px_per_um,
+            scale_sigma_px_per_um=self._sight.scale_sigma_px_per_um, zoom=self._zoom(),
+            speed_um_s=self.settings.speed_um_s, tare_uN=None if tare is None else tare.offset_uN,
+        )  # fmt: skip
+
+    def _zoom(self) -> float | None:
+        microscope = self._rig.file.microscope
+        motor = self._rig.devices.get(microscope.zoom) if microscope is not None else None
+        return motor.read().zoom if isinstance(motor, ZoomMotor) and motor.link == "open" else None
+
+
+class _Felt:
+    """Whether the force has been beyond a threshold for some readings in a row."""
+
+    def __init__(self, threshold_uN: float, readings: int) -> None:
+        self.force_uN = math.nan
+        self._threshold_uN = threshold_uN
+        self._needed = readings
+        self._beyond = 0
+
+    @property
+    def enough(self) -> bool:
+        return self._beyond >= self._needed
+
+    def take(self, sample: ForceSample) -> None:
+        if self.enough:
+            return
+        beyond = abs(sample.force_uN) > self._threshold_uN  # False for NaN
+        self._beyond = self._beyond + 1 if beyond else 0
+        if beyond:
+            self.force_uN = sample.force_uN
+
+
+class _Lost:
+    """Whether the contact point has been lost for too many frames in a row."""
+
+    def __init__(self) -> None:
+        self._missing = 0
+        self.too_long = False
+
+    def take(self, sample: DeformationSample) -> None:
+        self._missing = 0 if sample.found else self._missing + 1
+        self.too_long = self.too_long or self._missing >= _LOST_FRAMES
+
+    def raise_if_too_long(self, camera: str) -> None:
+        if self.too_long:
+            raise TargetLost(
+                f"the contact point was not seen in {_LOST_FRAMES} frames in a row; the probe was stopped",
+                device=camera,
+                remedy="check focus and light, and that nothing covers the contact point",
+                moved="yes",
+            )

@@ -1,0 +1,213 @@
+"""Turns a characterisation into its result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from microdrivers.core.contact_samples import IndentationSample, VisionForceSample
+from microdrivers.core.errors import MicrodriversError
+from microdrivers.core.units import NS_PER_S
+from microdrivers.estimators.force.identify import Identification
+from microdrivers.estimators.force.motion_limit import largest_speed_um_s
+from microdrivers.estimators.force.protocol_fit import ProtocolFit
+from microdrivers.estimators.force.vision_force import OUTSIDE_RANGE
+from microdrivers.results.force import (
+    Contact,
+    ForceResult,
+    ForceTraces,
+    Identifiable,
+    Misfit,
+    ProtocolResult,
+    Setup,
+    SlipFit,
+    VisionCheck,
+)
+from microdrivers.results.record import Provenance, Trace
+from microdrivers.routines.force.characterisation import ForceRun, Indentation
+from microdrivers.routines.force.source import IndentationSetup
+
+Array = npt.NDArray[np.float64]
+
+
+def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
+    """All that was found, with what it is valid for."""
+    found = run.identification
+    best = found.protocols[found.best]
+    check = compare(run.check) if run.check is not None else None
+    largest_uN = float(np.nanmax(run.record.force_uN))
+    return ForceResult(
+        complete=run.complete,
+        contact=Contact(
+            time_s=best.contact_time_s,
+            deformation_um=best.contact_um,
+            deformation_sigma_um=_known(best.sigma_contact_um),
+        ),
+        protocols={name: _protocol(fit, _relative_scale_sigma(run.setup)) for name, fit in found.protocols.items()},
+        best=found.best,
+        slip=_slip(found),
+        misfit=Misfit(
+            found=best.misfit.found,
+            statistic=_known(best.misfit.statistic),
+            p_value=_known(best.misfit.p_value),
+            text=best.misfit.text,
+        ),
+        vision_force_error_percent=None if check is None else check.error_percent,
+        vision_check=check,
+        largest_speed_um_s=_speed_limit(best, largest_uN),
+        excluded_samples=_excluded(run),
+        deformation_sigma_um=found.deformation_sigma_um,
+        force_sigma_uN=found.force_sigma_uN,
+        setup=_setup(run, best, largest_uN),
+        traces=_traces(run),
+        notes=_notes(run, check),
+        provenance=provenance,
+    )
+
+
+def compare(check: Indentation) -> VisionCheck | None:
+    """The camera's force against the sensor's, frame by frame; None without a common frame."""
+    pairs = _pairs(check)
+    if not pairs:
+        return None
+    measured = np.array([sample.force_uN for sample, _ in pairs])
+    seen = np.array([force.force_uN for _, force in pairs])
+    power = float(np.sqrt(np.mean(measured**2)))
+    if not power > 0.0:
+        return None
+    return VisionCheck(
+        error_percent=100.0 * float(np.sqrt(np.mean((seen - measured) ** 2))) / power,
+        largest_error_uN=float(np.max(np.abs(seen - measured))),
+        samples=len(pairs),
+        outside_range=sum(OUTSIDE_RANGE in force.flags for _, force in pairs),
+    )
+
+
+def _pairs(check: Indentation) -> list[tuple[IndentationSample, VisionForceSample]]:
+    forces = {force.t_ns: force for force in check.forces if math.isfinite(force.force_uN)}
+    return [(sample, forces[sample.t_ns]) for sample in check.samples if sample.t_ns in forces]
+
+
+def _protocol(fit: ProtocolFit, scale_sigma: float) -> ProtocolResult:
+    """With what the scale's own uncertainty adds: a length wrong by a share of itself is so in every sample."""
+    slopes = scale_sigma * np.array([fit.k1_uN_per_um, 3.0 * fit.k2_uN_per_um3, fit.b_loading_uN_s_per_um])
+    covariance = fit.covariance + np.outer(slopes, slopes)
+    known = bool(np.isfinite(covariance).all())
+    sigmas = np.sqrt(np.diag(covariance).clip(min=0.0))
+    return ProtocolResult(
+        k1_uN_per_um=fit.k1_uN_per_um,
+        k1_sigma_uN_per_um=_known(sigmas[0]),
+        k2_uN_per_um3=fit.k2_uN_per_um3,
+        k2_sigma_uN_per_um3=_known(sigmas[1]),
+        b_uN_s_per_um=fit.b_loading_uN_s_per_um,
+        b_sigma_uN_s_per_um=_known(sigmas[2]),
+        b_unloading_uN_s_per_um=fit.b_unloading_uN_s_per_um,
+        m_kg=fit.m_kg,
+        covariance=covariance.tolist() if known else None,
+        error_percent=fit.error_percent,
+        noise_residual_ratio=_known(fit.noise_residual_ratio),
+        condition_number=_known(fit.condition_number),
+        identifiable=Identifiable(
+            **{name: fit.identifiable.get(name, False) for name in ("k1", "k2", "b", "m")}, reasons=dict(fit.weak)
+        ),
+    )
+
+
+def _relative_scale_sigma(setup: IndentationSetup) -> float:
+    """Relative standard deviation of all lengths; 0 where a recording states them."""
+    scale, sigma = setup.scale_px_per_um, setup.scale_sigma_px_per_um
+    return sigma / scale if scale and sigma else 0.0
+
+
+def _slip(found: Identification) -> SlipFit | None:
+    slip = found.slip
+    if slip is None:
+        return None
+    return SlipFit(
+        offset_um=slip.offset_um,
+        offset_sigma_um=_known(slip.sigma_offset_um),
+        rate_per_s=slip.rate_per_s,
+        rate_sigma_per_s=_known(slip.sigma_rate_per_s),
+        not_returned_um=slip.not_returned_um,
+        identifiable=slip.identifiable,
+    )
+
+
+def _speed_limit(best: ProtocolFit, force_uN: float) -> float | None:
+    """What keeps the predicted force at the deepest point below the largest that was measured."""
+    try:
+        return _known(largest_speed_um_s(best.model(), max_force_uN=force_uN, depth_um=best.deepest_um))
+    except MicrodriversError:  # the model says nothing about speeds here
+        return None
+
+
+def _excluded(run: ForceRun) -> dict[str, int]:
+    excluded = {reason: len(where) for reason, where in run.identification.excluded_samples.items() if len(where)}
+    for reason, count in run.first.unmatched.items():
+        excluded[f"frames_{reason.lower()}"] = count
+    return excluded
+
+
+def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
+    known = run.setup
+    return Setup(
+        sensor=known.sensor,
+        stage=known.stage,
+        camera=known.camera,
+        scale_source=known.scale_source,
+        scale_px_per_um=known.scale_px_per_um,
+        scale_sigma_px_per_um=known.scale_sigma_px_per_um,
+        zoom=known.zoom,
+        speed_um_s=best.fastest_um_s if known.speed_um_s is None else known.speed_um_s,
+        deepest_um=best.deepest_um,
+        largest_force_uN=largest_uN,
+        tare_uN=known.tare_uN,
+    )
+
+
+def _traces(run: ForceRun) -> ForceTraces:
+    record, found = run.record, run.identification
+    pairs = _pairs(run.check) if run.check is not None else []
+    start_ns = pairs[0][0].t_ns if pairs else 0
+    return ForceTraces(
+        time_s=record.time_s.tolist(),
+        deformation_um=record.deformation_um.tolist(),
+        force_uN=record.force_uN.tolist(),
+        branch=found.branches.labels(),
+        fitted_uN={name: _trace(fit.force_uN) for name, fit in found.protocols.items()},
+        check_time_s=[(sample.t_ns - start_ns) / NS_PER_S for sample, _ in pairs],
+        check_force_uN=[sample.force_uN for sample, _ in pairs],
+        check_vision_uN=_trace([force.force_uN for _, force in pairs]),
+    )
+
+
+def _trace(values: Sequence[float] | Array) -> Trace:
+    return [float(value) if math.isfinite(value) else None for value in values]
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
+    notes = [f"{note[0].upper()}{note[1:]}." for note in run.identification.notes]
+    if not run.complete:
+        notes.append("The run was interrupted; the result holds what had been measured until then.")
+    lost = run.first.unmatched.get("LOST", 0)
+    if lost:
+        notes.append(f"The contact point was not seen in {lost} frames.")
+    if check is not None and check.outside_range:
+        notes.append(
+            f"{check.outside_range} of {check.samples} frames of the fresh indentation lie outside the range in which "
+            "the model was identified."
+        )
+    best = run.identification.protocols[run.identification.best]
+    if best.misfit.found:
+        notes.append(
+            "The model does not explain this specimen within the noise: use its parameters with care, and its force "
+            "from the camera only near the conditions of this record."
+        )
+    return notes

@@ -1,0 +1,72 @@
+"""What a force characterisation needs of whoever publishes the samples: a live probe, a recording, a test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
+from microdrivers.core.contact_samples import DeformationSample
+from microdrivers.core.samples import Frame
+from microdrivers.routines.progress import Progress
+
+
+class IndentationNames(NamedTuple):
+    """Topics: the sensor's readings, the deformations, and the frames that these come from (None: they are given)."""
+
+    sensor: str
+    deformation: str
+    camera: str | None
+
+
+class FrameTracker(Protocol):
+    """Finds the deformation in a frame."""
+
+    def update(self, frame: Frame) -> DeformationSample:
+        """Track one frame; `found` is False if the contact point is lost."""
+
+
+class IndentationSetup(NamedTuple):
+    """How the specimen is indented and seen; None where that is not known.
+
+    Attributes:
+        scale_source: where µm come from.
+        speed_um_s: of the tool while loading.
+        tare_uN: the sensor's zero that was in use.
+    """
+
+    sensor: str
+    stage: str | None
+    camera: str | None
+    scale_source: str
+    scale_px_per_um: float | None
+    scale_sigma_px_per_um: float | None
+    zoom: float | None
+    speed_um_s: float | None
+    tare_uN: float | None
+
+
+class IndentationSource(Protocol):
+    """Presses on a specimen and publishes what camera and sensor say.
+
+    Attributes:
+        repeatable: whether `indent` may be called again, for a fresh indentation of the same specimen.
+    """
+
+    bus: Bus
+    clock: Clock
+    names: IndentationNames
+    repeatable: bool
+
+    def prepare(self, progress: Progress) -> FrameTracker | None:
+        """Make everything ready for an indentation; returns what finds the deformation in frames."""
+
+    def indent(self, begin: Callable[[], None], progress: Progress) -> None:
+        """Press once, to the limit and back. Calls `begin` when what follows belongs to the indentation."""
+
+    def finish(self) -> None:
+        """On any way out, an interruption included: the tool is away from the specimen and nothing moves any more."""
+
+    def setup(self) -> IndentationSetup:
+        """What is known of the arrangement, valid after `prepare`."""

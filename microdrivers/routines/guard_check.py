@@ -1,0 +1,62 @@
+"""What the doctor says of guarded motion: how fast a force guard's stop leaves, and which boxes tools can reach."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+
+from microdrivers.core.errors import MicrodriversError
+from microdrivers.core.units import NS_PER_MS
+from microdrivers.devices.fine_stage import FineStage
+from microdrivers.rig import Rig
+from microdrivers.rig.safety_force_guard import ForceGuard
+from microdrivers.routines.findings import DeviceDiagnosis
+
+REHEARSALS = 20
+LATENCY_LIMIT_MS = 5.0
+
+
+def check_guards(rig: Rig, diagnoses: Sequence[DeviceDiagnosis]) -> None:
+    """Rehearse each force guard on its stage at rest, and name the boxes within reach; nothing moves.
+
+    The findings are added to those of the sensors and of the stages.
+    """
+    found = {diagnosis.name: diagnosis for diagnosis in diagnoses}
+    for guard in rig.safety.guards.values():
+        sensor, stage = found.get(guard.settings.sensor), rig.devices.get(guard.settings.stage)
+        if sensor is not None and isinstance(stage, FineStage):
+            _check_guard(guard, stage, sensor)
+    for name, device in rig.devices.items():
+        if isinstance(device, FineStage) and device.link == "open" and name in found:
+            boxes = rig.safety.keep_out.reachable(device)
+            if boxes:
+                found[name].ok(f"its tip could reach and is kept out of: {', '.join(boxes)}")
+
+
+def _check_guard(guard: ForceGuard, stage: FineStage, found: DeviceDiagnosis) -> None:
+    what = f"its guard stops {stage.name} beyond {guard.settings.max_force_uN:g} µN"
+    try:
+        took_ms = _rehearsed_ms(guard, stage)
+    except MicrodriversError as error:
+        found.failed(error, f"{what}; its rehearsal failed")
+        return
+    if not took_ms:
+        found.warn(f"{what}; not rehearsed, since {stage.name} is not known to be at rest", "open it, and let it rest")
+        return
+    if stage.clock.simulated:
+        found.ok(f"{what}, within the reading; how long a stop takes to leave is measured in real time only")
+        return
+    median_ms, worst_ms = statistics.median(took_ms), max(took_ms)
+    found.figures |= {"stop_median_ms": median_ms, "stop_worst_ms": worst_ms}
+    found.judge(
+        worst_ms <= LATENCY_LIMIT_MS,
+        f"{what}: from reading to stop command {median_ms:.2f} ms, {worst_ms:.2f} ms at worst of {REHEARSALS}",
+        "let nothing else load this computer, and give the tools a bus of their own",
+    )
+
+
+def _rehearsed_ms(guard: ForceGuard, stage: FineStage) -> list[float]:
+    newest = stage.topic.latest
+    if stage.link != "open" or stage.may_be_moving or newest is None or newest.moving:
+        return []
+    return [guard.rehearse() / NS_PER_MS for _ in range(REHEARSALS)]

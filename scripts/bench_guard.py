@@ -1,0 +1,235 @@
+"""The force guard's figures: how far the force overshoots its limit, and how long a stop takes to leave.
+
+    python scripts/bench_guard.py [overshoot] [latency] [--trips 300] [--speed-um-s 5]
+
+Without a name both are measured, in about two minutes. Overshoot: in simulation, the probe pressed on each preset of
+the specimen, and on a hard obstacle, until the guard stops it. Latency: probe stage and force sensor served by another
+process behind a serial CAN adapter on a pseudo-terminal, whose true force steps over the limit and back; the stop is
+timed when it is handed to the port, and when it has passed on the emulated bus.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import logging
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from microdrivers.configs import shipped_rig
+from microdrivers.core.clock import SimulatedClock
+from microdrivers.core.errors import MoveCancelled
+from microdrivers.core.samples import DeviceEvent, ForceSample
+from microdrivers.devices.fine_stage import FineStage
+from microdrivers.devices.force_sensor import ForceSensor
+from microdrivers.fakes.can import medium_named
+from microdrivers.rig import Rig, build_rig, load_rig_file, open_rig
+from microdrivers.rig.serving import ServedRig
+
+STAGE, SENSOR = "probe_stage", "probe_force"
+LIMITS_UN = {
+    "single": 500.0, "unloading_springs": 500.0, "slip_corrected": 500.0, "viscoelastic": 500.0, "obstacle": 1500.0,
+}  # fmt: skip
+OBSTACLE_UM, OBSTACLE_UN_PER_UM = -200.0, 50.0
+MOST_OVERSHOOT, MOST_LATENCY_MS = 0.02, 5.0
+HALF_PERIOD_NS = 60_000_000
+QUICK_STOP = b"\x02\x00"
+CONTROL_IDS = range(0x200, 0x280)
+
+
+def line(figure: str, limit: str, measured: str) -> None:
+    """One row of the table."""
+    print(f"{figure:<74} | {limit:>9} | {measured}", flush=True)
+
+
+def part_of_workstation(folder: Path, *, limit_uN: float, heartbeat_ms: int = 100) -> Path:
+    """The workstation's probe alone, with that limit."""
+    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    for section in ("microscope", "probe"):
+        data.pop(section, None)
+    data["devices"] = {name: data["devices"][name] for name in (STAGE, SENSOR)}
+    data["devices"][STAGE]["heartbeat_ms"] = heartbeat_ms
+    data["safety"]["force_guards"] = [{"sensor": SENSOR, "stage": STAGE, "max_force_uN": limit_uN}]
+    file = folder / "probe.yaml"
+    file.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return file
+
+
+# ---------------------------------------------------------------------- overshoot
+
+
+def overshoot(preset: str, *, speed_um_s: float, folder: Path) -> tuple[float, float]:
+    """The largest true force over the limit, as a share of it; and the stiffness there, µN/µm."""
+    limit_uN = LIMITS_UN[preset]
+    specimen = {"preset": "none" if preset == "obstacle" else preset}
+    rig = build_rig(
+        part_of_workstation(folder, limit_uN=limit_uN), fake=True, seed=1, clock=SimulatedClock(),
+        world_overrides={"specimen": specimen},
+    )  # fmt: skip
+    with rig:
+        return _press_until_stopped(rig, preset, limit_uN, speed_um_s)
+
+
+def _press_until_stopped(rig: Rig, preset: str, limit_uN: float, speed_um_s: float) -> tuple[float, float]:
+    assert rig.simulation is not None
+    world: Any = rig.simulation.world
+    stage, sensor = rig.device(STAGE, FineStage), rig.device(SENSOR, ForceSensor)
+    true_uN: list[tuple[float, float]] = []
+    axis = world.fine_stage_axes[STAGE]["x"]
+    stage.reference(stage.reference_order)
+    stage.move_to(x_um=-100.0, y_um=0.0, z_um=0.0)
+    sensor.tare()
+    if preset == "obstacle":
+        world.pressed[SENSOR] = lambda t_ns: OBSTACLE_UN_PER_UM * max(0.0, OBSTACLE_UM - axis.position_at(t_ns))
+    near_um = OBSTACLE_UM + 5.0 if preset == "obstacle" else -405.0
+    stage.move_to(x_um=near_um, speed_um_s=200.0)
+    sensor.topic.subscribe(
+        lambda sample: true_uN.append((axis.position_at(sample.t_ns), world.force_uN(SENSOR, sample.t_ns)))
+    )
+    with contextlib.suppress(MoveCancelled):
+        stage.move_to(x_um=stage.limits["x"].min, speed_um_s=speed_um_s)
+        print(f"{preset}: the guard has not tripped, {true_uN[-1][1]:.0f} µN", file=sys.stderr)
+    place_um, force_uN = np.array(true_uN[-400:]).T
+    loading = slice(0, max(2, int(np.argmax(force_uN))))
+    slope = np.polyfit(-place_um[loading][-200:], force_uN[loading][-200:], 1)[0]
+    return float(force_uN.max() / limit_uN - 1.0), float(slope)
+
+
+def measure_overshoot(speed_um_s: float) -> bool:
+    """Print the rows of all presets; tells whether all are good."""
+    worst = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        for preset, limit_uN in LIMITS_UN.items():
+            share, slope = overshoot(preset, speed_um_s=speed_um_s, folder=Path(folder))
+            worst = max(worst, share)
+            figure = f"overshoot at {speed_um_s:g} µm/s, {preset}, {slope:.1f} µN/µm at the limit of {limit_uN:g} µN"
+            line(figure, f"≤ {MOST_OVERSHOOT:.0%}", f"{share:.3%}")
+    return worst <= MOST_OVERSHOOT
+
+
+# ---------------------------------------------------------------------- latency
+
+
+def serve(file: Path, served: Path, limit_uN: float) -> None:
+    """The other process: a true force that steps over the limit and back, and the bus' own view of the stops."""
+    with ServedRig(load_rig_file(file), seed=1) as serving:
+        world: Any = serving.simulation.world
+        force_uN = 1.2 * limit_uN
+        world.pressed[SENSOR] = lambda t_ns: force_uN * (t_ns // HALF_PERIOD_NS % 2)
+        stops_ns: list[int] = []
+        medium: Any = medium_named("socketcan:can0")
+
+        def note(t_ns: int, who: str, frame: Any) -> None:
+            if who == "host" and frame.id in CONTROL_IDS and frame.data == QUICK_STOP:
+                stops_ns.append(t_ns)
+
+        medium.on_passed = note
+        serving.write(served)
+        print("ready", flush=True)
+        sys.stdin.readline()
+        print(json.dumps(stops_ns), flush=True)
+
+
+@contextlib.contextmanager
+def served_probe(folder: Path, limit_uN: float) -> Iterator[tuple[Path, subprocess.Popen[str]]]:
+    """The probe behind a serial adapter, in another process."""
+    file = part_of_workstation(folder, limit_uN=limit_uN, heartbeat_ms=2000)
+    served = folder / "served.yaml"
+    command = [sys.executable, __file__, "serve", str(file), str(served), str(limit_uN)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield served, process
+    finally:
+        process.communicate()
+
+
+def measure_latency(trips: int) -> bool:
+    """Print the rows; tells whether they are good."""
+    logging.disable(logging.WARNING)  # one line a trip
+    limit_uN = 1000.0
+    stops: list[tuple[int, int]] = []
+    over: list[ForceSample] = []
+    with tempfile.TemporaryDirectory() as folder, served_probe(Path(folder), limit_uN) as (file, process):
+        with open_rig(file) as rig:
+            rehearsed_ms = [rig.safety.guards[SENSOR].rehearse() / 1e6 for _ in range(100)]
+            first_over: list[ForceSample] = []
+
+            def watch(sample: ForceSample) -> None:
+                if not abs(sample.raw_uN) > limit_uN:
+                    first_over.clear()
+                elif not first_over:
+                    first_over.append(sample)
+                    over.append(sample)
+
+            def stopped(event: DeviceEvent) -> None:
+                if event.kind == "stopped" and event.reason != "rehearsal":
+                    stops.append((event.t_ns, rig.clock.now_ns()))
+
+            rig.devices[SENSOR].topic.subscribe(watch)
+            rig.devices[STAGE].events.subscribe(stopped)
+            rig.safety.begin(STAGE)
+            rig.clock.sleep(trips * 2 * HALF_PERIOD_NS / 1e9)
+            handed_ns, samples = [t_ns for t_ns, _ in stops], list(over)
+        process.stdin.write("end\n")  # type: ignore[union-attr]
+        process.stdin.flush()  # type: ignore[union-attr]
+        on_bus_ns = json.loads(process.stdout.readline())  # type: ignore[union-attr]
+    logging.disable(logging.NOTSET)
+    return _report_latency(rehearsed_ms, handed_ns, samples, on_bus_ns)
+
+
+def _report_latency(
+    rehearsed_ms: list[float], handed_ns: list[int], samples: list[ForceSample], on_bus_ns: list[int]
+) -> bool:
+    edges_ns = np.array(sorted({t_ns // HALF_PERIOD_NS for t_ns in handed_ns})) * HALF_PERIOD_NS
+    taken_ns = np.array([sample.t_ns for sample in samples])
+    from_sample = [(t_ns - taken_ns[taken_ns <= t_ns][-1]) / 1e6 for t_ns in handed_ns if (taken_ns <= t_ns).any()]
+    passed_ns = np.array(on_bus_ns)
+    first_passed = [
+        passed_ns[passed_ns >= edge_ns][0] - edge_ns for edge_ns in edges_ns if (passed_ns >= edge_ns).any()
+    ]
+    limit = f"≤ {MOST_LATENCY_MS:g} ms"
+    line("guard called → stop handed to the port (rehearsal at rest)", limit, _spread(rehearsed_ms))
+    line("sample (its instant) → stop handed to the port, served CAN", limit, _spread(from_sample))
+    whole = [ns / 1e6 for ns in first_passed]
+    line("true force over the limit → first quick stop has passed on the bus", "–", _spread(whole))
+    return float(np.percentile(from_sample, 99)) <= MOST_LATENCY_MS
+
+
+def _spread(values_ms: list[float]) -> str:
+    p50, p99 = np.percentile(values_ms, [50, 99])
+    return f"p50 {p50:.2f}, p99 {p99:.2f}, worst {max(values_ms):.2f} ms ({len(values_ms)})"
+
+
+def main() -> int:
+    """Print the table; 0 if all figures are good."""
+    if sys.argv[1:2] == ["serve"]:
+        serve(Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]))
+        return 0
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("figures", nargs="*", choices=["overshoot", "latency", []], help="default: both")
+    parser.add_argument("--trips", type=int, default=300)
+    parser.add_argument("--speed-um-s", type=float, default=5.0)
+    asked = parser.parse_args()
+    line("figure", "limit", "measured")
+    good = True
+    if not asked.figures or "overshoot" in asked.figures:
+        logging.disable(logging.WARNING)
+        good &= measure_overshoot(asked.speed_um_s)
+        logging.disable(logging.NOTSET)
+    if not asked.figures or "latency" in asked.figures:
+        good &= measure_latency(asked.trips)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,299 @@
+"""Force from the camera alone on closed-form indentations of specimens whose model is known."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from microdrivers.core.contact_samples import DeformationSample, VisionForceSample
+from microdrivers.estimators.force.model import SpecimenModel
+from microdrivers.estimators.force.vision_force import VisionForce, VisionForceSettings
+
+Array = npt.NDArray[np.float64]
+
+RATE_HZ = 30.0
+PIXEL_UM = 0.06
+CONTACT_S = 2.0
+
+PRESETS = {
+    "single": SpecimenModel(4.5161, 1e-4, 27.72, 27.72),
+    "unloading_springs": SpecimenModel(2.9577, 1e-4, 51.3317, 0.0),
+    "slip_corrected": SpecimenModel(5.8781, 3.8346e-5, 1.1834, 0.0, slip_um=25.0, slip_rate_per_s=0.1),
+}
+
+
+class Record(NamedTuple):
+    t_s: Array
+    deformation_um: Array
+    force_uN: Array
+
+
+def indentation(
+    preset: SpecimenModel, *, speed_um_s: float = 5.0, depth_um: float = 100.0, hold_s: float = 0.0, phase: float = 0.3
+) -> Record:
+    """Eqs. (21) and (26) along a trapezoid. The specimen pushes only: once its force is used up it is on its own."""
+    in_s = depth_um / speed_um_s
+    t = np.arange(0.0, CONTACT_S + 2.0 * in_s + hold_s + 1.0, 1.0 / RATE_HZ) + phase / RATE_HZ
+    since = t - CONTACT_S
+    tool = speed_um_s * np.minimum(np.minimum(since, in_s), 2.0 * in_s + hold_s - since)
+    tool_speed = np.where(since < in_s, speed_um_s, np.where(since < in_s + hold_s, 0.0, -speed_um_s))
+    gone = np.exp(-preset.slip_rate_per_s * np.maximum(since, 0.0))
+    slip = preset.slip_um * (1.0 - gone)
+    x, v = tool - slip, tool_speed - preset.slip_um * preset.slip_rate_per_s * gone
+    b = np.where(v > 0.0, preset.b_loading_uN_s_per_um, preset.b_unloading_uN_s_per_um)
+    force = preset.k1_uN_per_um * x + preset.k2_uN_per_um3 * x**3 + b * v
+    touching = (since > 0.0) & (x > 0.0) & (force > 0.0)
+    lost = int(np.flatnonzero(~touching & (since > in_s))[0])
+    touching[lost:] = False
+    seen = np.where(since > 0.0, tool, 0.0)
+    seen[lost:] = relaxing(preset, x[lost - 1], len(t) - lost) + slip[lost:]
+    return Record(t, seen, np.where(touching, force, 0.0))
+
+
+def relaxing(preset: SpecimenModel, start_um: float, count: int) -> Array:
+    """A specimen that nothing presses: `b ẋ + k1 x + k2 x³ = 0`, in fine steps; at once without a damper."""
+    x, found = start_um, []
+    for _ in range(count):
+        if preset.b_unloading_uN_s_per_um > 0.0:
+            for _ in range(10):
+                x -= (
+                    (preset.k1_uN_per_um + preset.k2_uN_per_um3 * x * x)
+                    * x
+                    / (preset.b_unloading_uN_s_per_um * 10.0 * RATE_HZ)
+                )
+        else:
+            x = 0.0
+        found.append(x)
+    return np.array(found)
+
+
+def frame(k: int, t_s: float, deformation_um: float, **changes: Any) -> DeformationSample:
+    return DeformationSample(
+        **{
+            "t_ns": round(1e9 * t_s),
+            "dt_ns": 1000,
+            "device": "microscope",
+            "seq": k,
+            "deformation_um": deformation_um,
+            "sigma_um": PIXEL_UM,
+            "tip_um": math.nan,
+            "tip_sigma_um": math.nan,
+            "u_px": 0.0,
+            "v_px": 0.0,
+            "found": True,
+            "frame_seq": k,
+            "exposure_ms": 2.0,
+        }
+        | changes
+    )
+
+
+def frames(record: Record, *, seed: int = 0, noise_um: float = PIXEL_UM) -> list[DeformationSample]:
+    noise = noise_um * np.random.default_rng(seed).standard_normal(len(record.t_s))
+    seen = (record.deformation_um + noise).tolist()
+    return [frame(k, t, x) for k, (t, x) in enumerate(zip(record.t_s.tolist(), seen, strict=True))]
+
+
+def fed(estimator: VisionForce, samples: list[DeformationSample]) -> list[VisionForceSample]:
+    return [force for sample in samples for force in estimator.update(sample)]
+
+
+def error_percent(found: list[VisionForceSample], record: Record) -> float:
+    """RMS(F − F̂)/RMS(F)."""
+    truth = record.force_uN[: len(found)]
+    estimate = np.array([force.force_uN for force in found])
+    return float(100.0 * np.sqrt(np.mean((truth - estimate) ** 2) / np.mean(truth**2)))
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_force_of_a_fresh_indentation(name: str) -> None:
+    for seed in range(2):
+        record = indentation(PRESETS[name], depth_um=90.0 + 10.0 * seed, phase=0.3 * seed)
+        estimator = VisionForce(PRESETS[name])
+        found = fed(estimator, frames(record, seed=seed))
+        assert len(found) == len(record.t_s) - estimator.settings.lag
+        assert [force.t_ns for force in found] == [round(1e9 * t) for t in record.t_s[: len(found)]]
+        assert error_percent(found, record) <= 5.0
+        forces = np.array([force.force_uN for force in found])
+        assert np.all(forces >= 0.0)
+        assert np.all(forces[record.t_s[: len(found)] < CONTACT_S - 0.1] == 0.0)
+        assert not any(force.flags for force in found)
+        assert not estimator.touches
+
+
+@settings(deadline=None, max_examples=6)
+@given(
+    st.sampled_from(list(PRESETS)), st.integers(0, 2**32 - 1), st.floats(4.5, 12.0), st.floats(60.0, 140.0),
+    st.sampled_from([0.0, 1.5]), st.floats(0.0, 1.0),
+)  # fmt: skip
+def test_at_any_speed_depth_and_phase(
+    name: str, seed: int, speed_um_s: float, depth_um: float, hold_s: float, phase: float
+) -> None:
+    record = indentation(PRESETS[name], speed_um_s=speed_um_s, depth_um=depth_um, hold_s=hold_s, phase=phase)
+    found = fed(VisionForce(PRESETS[name]), frames(record, seed=seed))
+    # A frame on the wrong side of a corner costs the damper's force, and a short push has few frames.
+    wrong_uN = 2.0 * PRESETS[name].b_loading_uN_s_per_um * speed_um_s
+    rms_uN = float(np.sqrt(np.mean(record.force_uN**2)))
+    assert error_percent(found, record) <= 3.0 + 100.0 * wrong_uN * math.sqrt(2.0 / len(found)) / rms_uN
+    assert all(force.force_uN >= 0.0 for force in found)
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_sigma_covers_the_error(name: str) -> None:
+    inside = []
+    for seed in range(2):
+        record = indentation(PRESETS[name], phase=0.25 * seed)
+        found = fed(VisionForce(PRESETS[name]), frames(record, seed=seed + 50))
+        inside += [
+            abs(f.force_uN - truth) <= 1.96 * f.sigma_uN for f, truth in zip(found, record.force_uN, strict=False)
+        ]
+    assert 0.9 <= np.mean(inside) <= 0.99
+
+
+def test_damper_changes_at_the_reversal_and_not_around_it() -> None:
+    preset = PRESETS["unloading_springs"]
+    record = indentation(preset, phase=0.5)
+    found = fed(VisionForce(preset), frames(record, noise_um=0.001))
+    turn = int(np.argmax(record.deformation_um))
+    errors = np.array([force.force_uN for force in found]) - record.force_uN[: len(found)]
+    assert np.abs(errors[turn - 5 : turn - 1]).max() < 15.0
+    assert np.abs(errors[turn + 2 : turn + 7]).max() < 15.0
+    assert found[turn - 3].force_uN - found[turn + 3].force_uN > 240.0
+
+
+def test_contact_instant_is_that_of_the_deformation_and_carries_the_slip() -> None:
+    preset = PRESETS["slip_corrected"]
+    errors = []
+    for seed in range(6):
+        estimator = VisionForce(preset)
+        fed(estimator, frames(indentation(preset, phase=seed / 6), seed=seed)[:300])
+        assert estimator.touches
+        assert estimator.touched_ns is not None
+        errors.append(estimator.touched_ns / 1e9 - CONTACT_S)
+    assert np.sqrt(np.mean(np.square(errors))) < 1.0 / RATE_HZ
+
+
+def test_zero_of_the_model_need_not_be_that_of_the_deformation() -> None:
+    preset = PRESETS["single"]
+    record = indentation(preset)
+    moved = [frame(k, t, x - 12.0) for k, (t, x) in enumerate(zip(record.t_s, record.deformation_um, strict=True))]
+    assert error_percent(fed(VisionForce(preset._replace(contact_um=-12.0)), moved), record) < 3.0
+
+
+def test_no_force_without_contact() -> None:
+    rng = np.random.default_rng(1)
+    for preset in PRESETS.values():
+        estimator = VisionForce(preset)
+        found = fed(
+            estimator, [frame(k, k / RATE_HZ, x) for k, x in enumerate(rng.normal(0.0, PIXEL_UM, 600).tolist())]
+        )
+        assert all(force.force_uN == 0.0 for force in found)
+        assert estimator.touched_ns is None
+
+
+def test_camera_that_looks_when_the_tool_presses_already_tells_the_force() -> None:
+    preset = PRESETS["single"]
+    found = fed(VisionForce(preset), [frame(k, k / RATE_HZ, 40.0) for k in range(40)])
+    assert found[0].force_uN == pytest.approx(preset.k1_uN_per_um * 40.0 + 1e-4 * 64000.0, abs=1.0)
+
+
+def test_second_push_is_felt_again() -> None:
+    preset = PRESETS["unloading_springs"]
+    record = indentation(preset, depth_um=40.0)
+    estimator = VisionForce(preset)
+    once = frames(record)
+    again = [frame(k, s.t_ns / 1e9 + 30.0, s.deformation_um) for k, s in enumerate(once)]
+    found = fed(estimator, [*once, *again])[len(once) :]
+    assert error_percent(found, record) <= 5.0
+
+
+def test_slip_begins_anew_once_the_specimen_has_come_back() -> None:
+    preset = PRESETS["slip_corrected"]
+    record = indentation(preset, depth_um=60.0)
+    estimator = VisionForce(preset)
+    once = frames(record)
+    again = [frame(k, s.t_ns / 1e9 + 60.0, s.deformation_um) for k, s in enumerate(once)]
+    found = fed(estimator, [*once, *again])[len(once) :]
+    assert error_percent(found, record) <= 2.0
+    # After the push itself the specimen stays where it has slipped to: the slip does not begin anew.
+    assert estimator.touched_ns is not None
+    assert estimator.touched_ns / 1e9 == pytest.approx(60.0 + CONTACT_S, abs=0.1)
+
+
+def test_lost_frames_are_said_at_once_in_order_and_recovered_from() -> None:
+    preset = PRESETS["single"]
+    record = indentation(preset)
+    samples = frames(record)
+    gone = frame(300, record.t_s[300], math.nan, found=False)
+    estimator = VisionForce(preset)
+    before = fed(estimator, samples[:300])
+    told = estimator.update(gone)
+    assert len(before) + len(told) == 301
+    assert told[-1].flags == {"LOST"}
+    assert math.isnan(told[-1].force_uN)
+    assert math.isnan(told[-1].sigma_uN)
+    after = fed(estimator, samples[301:])
+    times = [force.t_ns for force in (*before, *told, *after)]
+    assert times == sorted(times)
+    errors = [f.force_uN - record.force_uN[301 + k] for k, f in enumerate(after)]
+    assert max(map(abs, errors[:100])) < 30.0
+
+
+def test_beyond_the_characterised_range_is_said() -> None:
+    preset = PRESETS["single"]._replace(deepest_um=60.0, fastest_um_s=6.0)
+    record = indentation(preset)
+    found = fed(VisionForce(preset), frames(record))
+    deeper = {record.t_s[k] for k, force in enumerate(found) if "OUTSIDE_RANGE" in force.flags}
+    depth = dict(zip(record.t_s.tolist(), record.deformation_um.tolist(), strict=True))
+    assert all(depth[t] > 59.8 for t in deeper)
+    assert len(deeper) == pytest.approx(2 * 40.0 / 5.0 * RATE_HZ, abs=8)
+    quick = fed(VisionForce(preset._replace(deepest_um=200.0)), frames(indentation(preset, speed_um_s=9.0)))
+    assert sum("OUTSIDE_RANGE" in force.flags for force in quick) > 200
+    same = fed(VisionForce(preset._replace(deepest_um=100.0, fastest_um_s=5.0)), frames(record))
+    assert not any(force.flags for force in same)
+
+
+def test_uncertain_model_widens_sigma() -> None:
+    record = indentation(PRESETS["single"])
+    covariance = tuple(np.diag([0.1**2, 1e-6**2, 1.0**2]).ravel().tolist())
+    plain = fed(VisionForce(PRESETS["single"]), frames(record))
+    unsure = fed(VisionForce(PRESETS["single"]._replace(covariance=covariance, residual_uN=2.0)), frames(record))
+    k = 400
+    x_um, v_um_s = plain[k].deformation_um, plain[k].velocity_um_s
+    added = math.hypot(0.1 * x_um, 1e-6 * x_um**3, 1.0 * v_um_s, 2.0)
+    assert unsure[k].sigma_uN == pytest.approx(math.hypot(plain[k].sigma_uN, added), rel=1e-6)
+    assert unsure[k].force_uN == plain[k].force_uN
+    assert plain[k].sigma_uN > math.hypot(4.5 * 0.03, 27.72 * 0.02)
+
+
+def test_spike_of_the_tracker_is_no_force() -> None:
+    preset = PRESETS["single"]
+    record = indentation(preset)
+    samples = frames(record)
+    clean = fed(VisionForce(preset), samples)
+    samples[400] = frame(400, record.t_s[400], record.deformation_um[400] + 5.0)
+    spoilt = fed(VisionForce(preset), samples)
+    assert max(abs(a.force_uN - b.force_uN) for a, b in zip(clean, spoilt, strict=True)) < 10.0
+
+
+def test_frame_that_comes_late_or_twice_is_counted_and_left_out() -> None:
+    samples = frames(indentation(PRESETS["single"], depth_um=20.0))
+    estimator = VisionForce(PRESETS["single"])
+    expected = fed(VisionForce(PRESETS["single"]), samples)
+    assert repr(fed(estimator, [*samples[:50], samples[49], samples[20], *samples[50:]])) == repr(expected)
+    assert estimator.late_frames == 2
+
+
+def test_longer_lag_is_allowed_and_a_shorter_one_refused() -> None:
+    record = indentation(PRESETS["single"])
+    found = fed(VisionForce(PRESETS["single"], VisionForceSettings(lag=8)), frames(record))
+    assert len(found) == len(record.t_s) - 8
+    assert error_percent(found, record) <= 5.0
+    with pytest.raises(ValueError, match="lag"):
+        VisionForce(PRESETS["single"], VisionForceSettings(lag=1))
