@@ -36,7 +36,7 @@ test-ports: $(READY)
 # The CAN tests on a real SocketCAN bus: this kernel's vcan if it has one, else User Mode Linux, which it fetches once.
 test-vcan: $(READY)
 	$(BIN)/python scripts/vcan-run --setup auto
-	$(BIN)/python scripts/vcan-run -t 300 -- \
+	$(BIN)/python scripts/vcan-run -t 300 -s -- \
 	  $(BIN)/python -m pytest -q -p no:cacheprovider -m vcan $(PYTEST_ARGS) tests/vcan
 
 # The tests that need devices which a container lacks, in an emulated PC. The first time it fetches Debian's kernel.

@@ -9,7 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
-from typing import NamedTuple, Protocol
+from typing import Protocol
+
+import msgspec
 
 from microdrivers.backends.lines.can_line import CanLine, Listening, Received
 from microdrivers.core.clock import Timer
@@ -33,7 +35,7 @@ _LOCK_S = 1.0
 _log = logging.getLogger(__name__)
 
 
-class Pulse(NamedTuple):
+class Pulse(msgspec.Struct, frozen=True, gc=False):
     """One SYNC.
 
     Attributes:
@@ -178,7 +180,10 @@ class SyncProducer:
                 self._line.wait(self._answered, (patient_until_ns - now_ns) / NS_PER_S)
 
     def _quiet_until_ns(self) -> int:
-        return max([each.quiet_until_ns for each in self._answering], default=0)
+        quiet_until_ns = 0
+        for each in self._answering:
+            quiet_until_ns = max(quiet_until_ns, each.quiet_until_ns)
+        return quiet_until_ns
 
     def _beat(self) -> None:
         """One beat of the fastest stream."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+
+import msgspec
 
 from microdrivers.backends.canopen.sync import LATE_NS, Pulse, SyncProducer
 from microdrivers.backends.lines.can_line import CanLine, Listening, Received
@@ -17,7 +18,7 @@ _INTERFRAME_BITS = 3
 _LONG_AGO_NS = -NS_PER_S
 
 
-class SyncSet(NamedTuple):
+class SyncSet(msgspec.Struct, frozen=True, gc=False):
     """One frame of each of several PDOs, all of one SYNC.
 
     Attributes:
@@ -40,16 +41,13 @@ class PdosMissing(LinkTimeout):
         self.missing = tuple(missing)
 
 
-class _Round:
-    """The answers to one SYNC, as far as they have come."""
+class _Round(msgspec.Struct):
+    """The answers to one SYNC, as far as they have come: by identifier."""
 
-    __slots__ = ("frames", "on_trial", "pulse", "wanted")
-
-    def __init__(self, pulse: Pulse, *, wanted: bool, on_trial: bool) -> None:
-        self.pulse = pulse
-        self.wanted = wanted
-        self.on_trial = on_trial
-        self.frames: dict[int, Received] = {}
+    pulse: Pulse
+    wanted: bool
+    on_trial: bool
+    frames: dict[int, Received] = msgspec.field(default_factory=dict)
 
 
 class SyncedPdos:
@@ -234,7 +232,7 @@ class SyncedPdos:
         return None
 
     def _hear(self, received: Received) -> None:
-        cob_id, _, t_ns, dt_ns = received
+        cob_id = received.cob_id
         with self._lock:
             if not self._counting:
                 self._ask_for_quiet(cob_id)
@@ -245,7 +243,7 @@ class SyncedPdos:
             else:
                 current = None
             if current is not None:
-                if t_ns + dt_ns < current.pulse.earliest_ns:
+                if received.t_ns + received.dt_ns < current.pulse.earliest_ns:
                     return  # it was on the bus before: an answer that counts as lost
                 current.frames[cob_id] = received
                 for each in self._rounds:
@@ -288,9 +286,9 @@ class SyncedPdos:
     def _interval(self, pulse: Pulse, frames: Sequence[Received]) -> tuple[int, int]:
         """When the SYNC reached the nodes: not before it can have passed, nor after the first answer has begun."""
         shortest_ns, earliest_ns = self._line.shortest_ns, pulse.earliest_ns
-        begun_ns = min([t_ns - shortest_ns[len(data)] for _, data, t_ns, _ in frames]) - self._gap_ns
+        begun_ns = min([frame.t_ns - shortest_ns[len(frame.data)] for frame in frames]) - self._gap_ns
         half_ns = max(0, begun_ns - earliest_ns) // 2
-        return earliest_ns + half_ns, half_ns + min([dt_ns for _, _, _, dt_ns in frames])
+        return earliest_ns + half_ns, half_ns + min([frame.dt_ns for frame in frames])
 
     def _discard(self) -> None:
         """Give up what is awaited: from now on nobody knows which SYNC a frame answers."""

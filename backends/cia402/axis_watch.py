@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+
+import msgspec
 
 from microdrivers.backends.cia402.objects import HOMING, PROFILE_POSITION
 from microdrivers.backends.cia402.states import State, Status, state_of
@@ -14,10 +15,11 @@ REST_NS = 10 * NS_PER_MS
 
 _STILL_COUNTS = 2
 _ENABLED, _AT_FAULT = State.OPERATION_ENABLED, (State.FAULT, State.FAULT_REACTION)
+_REACHED = Status.TARGET_REACHED
 _LONG_AGO_NS = -(1 << 62)
 
 
-class Reading(NamedTuple):
+class Reading(msgspec.Struct, frozen=True, gc=False):
     """What one drive reports at one instant: status word, position in counts, mode of operation."""
 
     status_word: int
@@ -113,7 +115,7 @@ class AxisWatch:
 
     def see(self, t_ns: int, reading: Reading) -> None:
         """Take in what the drive reported at `t_ns`."""
-        status_word, position, mode = reading
+        status_word, position, mode = reading.status_word, reading.position, reading.mode
         if self._rest_position is None or abs(position - self._rest_position) > self._still:
             if self._rest_position is not None:  # the first reading ever shows an axis at rest, as far as anybody knows
                 self._rest_since_ns = t_ns
@@ -124,7 +126,7 @@ class AxisWatch:
         if self._enabled and not holds and state is not None:
             self.dropped = True
             self.forget_target()
-        reached = bool(status_word & Status.TARGET_REACHED)
+        reached = bool(status_word & _REACHED)
         if holds and self.target is not None and mode == PROFILE_POSITION:
             self.moving = not (reached and self._acknowledged)
             self.on_target = not self.moving and abs(position - self.target) <= self._tolerance

@@ -107,7 +107,7 @@ class MeasurementStream:
     # ------------------------------------------------------------------ frames
 
     def _hear(self, received: Received) -> None:
-        _, data, t_ns, dt_ns = received
+        data, t_ns = received.data, received.t_ns
         if len(data) != self._length:
             self.odd += 1
             return
@@ -116,7 +116,8 @@ class MeasurementStream:
             self._count_missing(t_ns - self._newest_ns)
         self._newest_ns = t_ns
         raw_uN, flags = self._decode(data)
-        self._on_measurement(Measurement(raw_uN, flags, t_ns - self._age_ns, dt_ns + self._age_half_ns))
+        dt_ns = received.dt_ns + self._age_half_ns
+        self._on_measurement(Measurement(raw_uN, flags, t_ns - self._age_ns, dt_ns))
 
     def _count_missing(self, gap_ns: int) -> None:
         """How many periods the frames are behind their timer: whole ones are losses, the rest waited for the bus.

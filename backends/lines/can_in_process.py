@@ -103,7 +103,7 @@ class InProcessReceiver:
         now_ns = clock.now_ns()
         deadline_ns = now_ns + seconds_to_ns(timeout_s)
         try:
-            while not up() and now_ns < deadline_ns and not self._line.lost:
+            while not up() and now_ns < deadline_ns and self._line.lost is None:
                 self._adapter.port.receive_until(up, min(deadline_ns, upkeep.do(now_ns)))
                 now_ns = clock.now_ns()
         except self._adapter.failures as error:

@@ -51,6 +51,7 @@ class CanLine:
 
     Attributes:
         counters: what has happened since it was opened.
+        lost: why the adapter is gone, if it is.
         newest_ns: stamp of the newest frame received, ns.
         shortest_ns: by number of bytes, the shortest time that a data frame can take on the bus.
         tap: is told every frame that passes, if somebody listens there.
@@ -67,7 +68,7 @@ class CanLine:
             (_SHORTEST_FRAME_BITS + 8 * length) * NS_PER_S // connection.bitrate for length in range(_MOST_BYTES + 1)
         ]
         self._adapter: CanAdapter | None = None
-        self._lost: LinkLost | None = None
+        self.lost: LinkLost | None = None
         self._users = 0
         self._life = threading.RLock()
         self._sending = threading.Lock()
@@ -87,7 +88,7 @@ class CanLine:
             LinkLost, ConfigError, UnsupportedError: it cannot be opened; the remedy says what to do.
         """
         with self._life:
-            if self._lost is not None:
+            if self.lost is not None:
                 self._end()
             if self._adapter is None:
                 self.counters = CanCounters()
@@ -108,7 +109,7 @@ class CanLine:
             self._receiver = InProcessReceiver(self, adapter, upkeep=self._upkeep)
         else:
             adapter = CanAdapter(self.connection, clock=self.clock, counters=self.counters, tap=self.tap)
-        self._adapter, self._lost = adapter, None
+        self._adapter, self.lost = adapter, None
         adapter.accept(self._listeners.cob_ids)
         if self._receiver is None:
             self._receiver = ThreadReceiver(self, adapter, name=f"CAN {self.connection.channel}")
@@ -120,7 +121,7 @@ class CanLine:
             receiver.end()
         if adapter is not None:
             adapter.close()
-        self._lost = None
+        self.lost = None
 
     # ------------------------------------------------------------------ traffic
 
@@ -261,11 +262,6 @@ class CanLine:
 
     # ------------------------------------------------------------------ for the receiver
 
-    @property
-    def lost(self) -> bool:
-        """Whether the adapter is gone."""
-        return self._lost is not None
-
     def hear(self, cob_id: int, data: bytes, t_ns: int, dt_ns: int) -> None:
         """A data frame with 11 bits of identifier has arrived at `t_ns` ± `dt_ns`."""
         self.counters.received += 1
@@ -294,9 +290,9 @@ class CanLine:
             return error
         error.what += self.counters.hint()
         with self._failing:
-            if self._lost is not None or self._adapter is not adapter:
+            if self.lost is not None or self._adapter is not adapter:
                 return error
-            self._lost = error
+            self.lost = error
         for flag in tuple(self._waiting):
             flag.set()
         for call in self._listeners.on_loss:
@@ -304,8 +300,8 @@ class CanLine:
         return error
 
     def _require_adapter(self) -> CanAdapter:
-        if self._lost is not None:
-            raise LinkLost(self._lost.what, remedy=self._lost.remedy)
+        if self.lost is not None:
+            raise LinkLost(self.lost.what, remedy=self.lost.remedy)
         if self._adapter is None:
             raise LinkLost("the CAN bus is closed", remedy="open the device first", moved="no")
         return self._adapter

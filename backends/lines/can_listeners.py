@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import NamedTuple
+
+import msgspec
 
 from microdrivers.core.clock import Clock, ClockEvent
 from microdrivers.core.errors import LinkLost
@@ -17,7 +18,7 @@ SILENCE_REMEDY = (
 _NEVER_NS = 1 << 63
 
 
-class Received(NamedTuple):
+class Received(msgspec.Struct, frozen=True, gc=False):
     """A data frame; `t_ns` ± `dt_ns` is when it had arrived on the bus, on the rig's clock."""
 
     cob_id: int
@@ -42,19 +43,16 @@ class Listening:
         end()
 
 
-class Awaited:
+class Awaited(msgspec.Struct):
     """The first frame that is accepted, as an answer. `found` is it, once `flag` is up."""
 
-    __slots__ = ("_accept", "flag", "found")
-
-    def __init__(self, accept: Callable[[bytes], bool], flag: ClockEvent) -> None:
-        self._accept = accept
-        self.flag = flag
-        self.found: Received | None = None
+    accept: Callable[[bytes], bool]
+    flag: ClockEvent
+    found: Received | None = None
 
     def hear(self, received: Received) -> None:
         """A frame with the identifier of the answer."""
-        if self.found is None and self._accept(received.data):
+        if self.found is None and self.accept(received.data):
             self.found = received
             self.flag.set()
 

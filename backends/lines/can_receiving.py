@@ -7,7 +7,7 @@ from typing import Protocol
 
 from microdrivers.backends.lines.can_adapter import CanAdapter
 from microdrivers.core.clock import Clock, ClockEvent
-from microdrivers.core.errors import LinkError
+from microdrivers.core.errors import LinkError, LinkLost
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
 
 _RECEIVE_S = 0.1
@@ -18,10 +18,8 @@ class ReceivingLine(Protocol):
     """What a receiver needs of its line."""
 
     clock: Clock
-
-    @property
-    def lost(self) -> bool:
-        """Whether the adapter is gone."""
+    lost: LinkLost | None
+    """Why the adapter is gone, if it is."""
 
     def hear(self, cob_id: int, data: bytes, t_ns: int, dt_ns: int) -> None:
         """A data frame with 11 bits of identifier has arrived at `t_ns` ± `dt_ns`."""
@@ -65,7 +63,7 @@ class ThreadReceiver:
     def wait(self, flag: ClockEvent, timeout_s: float) -> None:
         """See `Receiver.wait`."""
         if threading.get_ident() != self._thread:
-            if not self._line.lost:
+            if self._line.lost is None:
                 flag.wait(timeout_s)
             return
         deadline_ns = self._clock.now_ns() + seconds_to_ns(timeout_s)
@@ -83,7 +81,7 @@ class ThreadReceiver:
 
     @property
     def _goes_on(self) -> bool:
-        return not (self._ended or self._line.lost)
+        return not self._ended and self._line.lost is None
 
     def _run(self) -> None:
         self._thread = threading.get_ident()

@@ -78,7 +78,7 @@ class FourSampleRecursion:
         ValueError: a scale or the ridge is not positive and finite.
     """
 
-    def __init__(self, *, scales: Scales | None = None, ridge: float = 1e-9, with_mass: bool = False) -> None:
+    def __init__(self, *, scales: Scales | None = None, ridge: float = 1e-11, with_mass: bool = False) -> None:
         self.scales = scales or Scales()
         if not all(math.isfinite(value) and value > 0.0 for value in (ridge, *self.scales)):
             raise ValueError(f"ridge {ridge} and scales {self.scales} must be positive and finite")

@@ -10,12 +10,11 @@ import numpy as np
 
 from microdrivers.estimators.force.branches import Branches
 from microdrivers.estimators.force.fit_motion import motion_everywhere
-from microdrivers.estimators.force.joint import BASE, MASS, Motion, force_of, slopes_of
+from microdrivers.estimators.force.joint import BASE, Motion, force_of, slopes_of
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import LOADING, Indices, Prepared, SeenBefore
 from microdrivers.estimators.force.protocol_fit import (
     ProtocolFit,
-    mass_of,
     named_parameters,
     parameter_covariance,
     weak_parameters,
@@ -147,7 +146,6 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
 
 def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolFit:
     motion = motion_everywhere(prepared, fit)
-    mass = bool(fit.theta[MASS])
     force, fitted = prepared.force_uN[prepared.used], force_of(fit.theta, motion)
     by_x, _ = slopes_of(fit.theta, motion)
     noise = np.hypot(by_x * prepared.deformation_sigma_um, prepared.force_sigma_uN)
@@ -165,13 +163,12 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
         fit.covariance,
         Motion(*(part[judged] for part in motion)),
         slips=slips,
-        mass=mass,
         structured_uN=misfit.structured_uN if misfit.found else 0.0,
     )
     names = ["k1", "k2", "b", "m", *(["slip", "slip_rate"] if slips else [])]
     return ProtocolFit(
         name=name,
-        m_kg=mass_of(fit.theta, mass),
+        m_kg=None,
         covariance=parameter_covariance(fit.covariance),
         error_percent=_percent(left[judged], force[judged]),
         error_percent_loading=_percent(left[loading], force[loading]),

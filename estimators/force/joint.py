@@ -15,10 +15,10 @@ import numpy as np
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.trajectory import Trajectory
 
-K1, K2, B_LOADING, B_UNLOADING, CONTACT, CONTACT_S, SLIP, RATE, BASE, MASS = range(10)
-"""Places in θ: µN/µm, µN/µm³, µN·s/µm twice, µm, s, µm, 1/s, µN (baseline of the force), kg."""
+K1, K2, B_LOADING, B_UNLOADING, CONTACT, CONTACT_S, SLIP, RATE, BASE = range(9)
+"""Places in θ: µN/µm, µN/µm³, µN·s/µm twice, µm, s, µm, 1/s, µN (baseline of the force)."""
 
-PARAMETERS = 10
+PARAMETERS = 9
 
 _ITERATIONS = 30
 _CONVERGED = 1e-4
@@ -111,10 +111,10 @@ def motion_of(theta: Array, time_s: Array, value: Array, rate: Array, accelerati
 
 
 def force_of(theta: Array, motion: Motion) -> Array:
-    """Eq. (21) without regard to contact, plus the baseline."""
-    x, v, a = motion
+    """Eq. (21) without mass and without regard to contact, plus the baseline."""
+    x, v, _ = motion
     damper = theta[B_LOADING] * np.maximum(v, 0.0) + theta[B_UNLOADING] * np.minimum(v, 0.0)
-    force: Array = theta[BASE] + theta[MASS] * a + damper + (theta[K1] + theta[K2] * x * x) * x
+    force: Array = theta[BASE] + damper + (theta[K1] + theta[K2] * x * x) * x
     return force
 
 
@@ -180,7 +180,7 @@ def _evaluated(problem: Problem, theta: Array, eta: Array) -> Solution:
 def force_columns(problem: Problem, at: Solution) -> Array:
     """Derivatives of the scaled forces by (free parameters, η), samples × both."""
     by_theta, by_x, by_v = _force_slopes(problem, at)
-    return np.hstack([by_theta, _by_eta(problem, at, by_x, by_v, slice(None), slice(None))])
+    return np.hstack([by_theta, _by_eta(problem, by_x, by_v, slice(None), slice(None))])
 
 
 def _force_slopes(problem: Problem, at: Solution) -> tuple[Array, Array, Array]:
@@ -190,11 +190,9 @@ def _force_slopes(problem: Problem, at: Solution) -> tuple[Array, Array, Array]:
     return by_theta / problem.force_sigma_uN, by_x / problem.force_sigma_uN, by_v / problem.force_sigma_uN
 
 
-def _by_eta(problem: Problem, at: Solution, by_x: Array, by_v: Array, rows: slice, columns: slice) -> Array:
+def _by_eta(problem: Problem, by_x: Array, by_v: Array, rows: slice, columns: slice) -> Array:
     family = problem.trajectory
     by_eta: Array = by_x[rows, None] * family.value[rows, columns] + by_v[rows, None] * family.rate[rows, columns]
-    if at.theta[MASS] != 0.0:
-        by_eta += at.theta[MASS] / problem.force_sigma_uN * family.acceleration[rows, columns]
     return by_eta
 
 
@@ -208,7 +206,7 @@ def _normal_equations(problem: Problem, at: Solution) -> tuple[Array, Array]:
     normal[:p, :p] += by_theta.T @ by_theta
     gradient[:p] += by_theta.T @ at.force_residual
     for rows, columns in problem.trajectory.blocks:
-        by_eta = _by_eta(problem, at, by_x, by_v, rows, columns)
+        by_eta = _by_eta(problem, by_x, by_v, rows, columns)
         value = problem.trajectory.value[rows, columns] / sigma
         here = slice(p + columns.start, p + columns.stop)
         normal[here, here] += by_eta.T @ by_eta + value.T @ value
@@ -221,7 +219,7 @@ def _normal_equations(problem: Problem, at: Solution) -> tuple[Array, Array]:
 
 def by_parameters(theta: Array, time_s: Array, motion: Motion) -> Array:
     """Derivatives of the force by θ, samples × PARAMETERS."""
-    x, v, a = motion
+    x, v, _ = motion
     by_x, by_v = slopes_of(theta, motion)
     offset, alpha = theta[SLIP], theta[RATE]
     since = time_s - theta[CONTACT_S]
@@ -234,7 +232,6 @@ def by_parameters(theta: Array, time_s: Array, motion: Motion) -> Array:
     columns[:, SLIP] = -by_x * (1.0 - decay) - by_v * alpha * decay
     columns[:, RATE] = -by_x * offset * since * decay - by_v * offset * decay * (1.0 - alpha * since)
     columns[:, BASE] = 1.0
-    columns[:, MASS] = a
     return columns
 
 

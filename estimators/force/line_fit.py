@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 
 class Point(NamedTuple):
-    """A position at an instant, with its weight in a fit."""
+    """A position at an instant."""
 
     t_s: float
     x_um: float
-    weight: float = 1.0
 
 
 class Fit(NamedTuple):
@@ -43,30 +42,33 @@ class Fit(NamedTuple):
 
     def velocity_um_s(self, t_s: float) -> float:
         """Its slope there."""
+        if self.bend == 0.0:
+            return self.slope
         return self.slope + self.bend * (2.0 * (t_s - self.middle_s) - self.skew)
 
     def velocity_spread_per_s(self, t_s: float) -> float:
         """Standard deviation of that slope over the positions'; infinite where they do not tell it."""
         if self.norm1 <= 0.0:
             return math.inf
+        if self.norm2 <= 0.0:
+            return 1.0 / math.sqrt(self.norm1)
         grow = 2.0 * (t_s - self.middle_s) - self.skew
-        return math.sqrt(1.0 / self.norm1 + (grow * grow / self.norm2 if self.norm2 > 0.0 else 0.0))
+        return math.sqrt(1.0 / self.norm1 + grow * grow / self.norm2)
 
 
 def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
-    """Weighted least squares; fewer than three instants make no parabola and fewer than two no slope."""
+    """Least squares; fewer than three instants make no parabola and fewer than two no slope."""
     # Sums about the newest point, so that no digits are lost.
-    zero_s, zero_um, _ = points[-1]
-    norm0 = first = level = second = rise = square = 0.0
-    for t, x, w in points:
+    zero_s, zero_um = points[-1]
+    norm0 = float(len(points))
+    first = level = second = rise = square = 0.0
+    for t, x in points:
         u, y = t - zero_s, x - zero_um
-        wu, wy = w * u, w * y
-        norm0 += w
-        first += wu
-        level += wy
-        second += wu * u
-        rise += wu * y
-        square += wy * y
+        first += u
+        level += y
+        second += u * u
+        rise += u * y
+        square += y * y
     middle = first / norm0
     level /= norm0
     norm1 = second - middle * first
@@ -76,13 +78,13 @@ def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
     line = Fit(zero_s + middle, zero_um + level, slope, 0.0, 0.0, 0.0, norm0, norm1, 0.0, left)
     if not parabola or len(points) < 4:
         return line
-    third = sum(w * (t - line.middle_s) ** 3 for t, _, w in points)
+    third = sum((t - line.middle_s) ** 3 for t, _ in points)
     line = line._replace(skew=third / norm1, spread=norm1 / norm0)
     norm2 = curve = 0.0
-    for t, x, w in points:
+    for t, x in points:
         bow = line.bow(t - line.middle_s)
-        norm2 += w * bow * bow
-        curve += w * bow * (x - line.level_um)
+        norm2 += bow * bow
+        curve += bow * (x - line.level_um)
     return line._replace(bend=curve / norm2, norm2=norm2, left_um2=left - curve * curve / norm2)
 
 
@@ -90,10 +92,10 @@ def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest
     """By how much the sum of squares falls if the line may change its slope at `points[j]`, j from newest to oldest."""
     gains = []
     middle, norm0, norm1, norm2 = line.middle_s, line.norm0, line.norm1, line.norm2
-    # Sums over the points beyond j: residual, weight, weight × bow, each plain and times u.
+    # Sums over the points beyond j: residual, 1 and bow, each plain and times u (1 also times u²).
     r0 = r1 = w0 = w1 = w2 = b0 = b1 = 0.0
     for j in range(len(points) - 1, oldest - 1, -1):
-        t, x, w = points[j]
+        t, x = points[j]
         u = t - middle
         if j <= newest:
             explained = r1 - u * r0
@@ -103,14 +105,14 @@ def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest
                 on2 = b1 - u * b0
                 own -= on2 * on2 / norm2
             gains.append(explained * explained / own if own > 0.0 else 0.0)
-        residual = w * (x - line.position_um(t))
+        residual = x - line.position_um(t)
         r0 += residual
         r1 += residual * u
-        w0 += w
-        w1 += w * u
-        w2 += w * u * u
+        w0 += 1.0
+        w1 += u
+        w2 += u * u
         if norm2 > 0.0:
-            bow = w * line.bow(u)
+            bow = line.bow(u)
             b0 += bow
             b1 += bow * u
     return gains
@@ -119,13 +121,13 @@ def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest
 def shape_gain(points: Sequence[Point], line: Fit, shape: Sequence[float]) -> float:
     """By how much the sum of squares falls if a multiple of `shape`, one value a point, is added to the fit."""
     explained = on0 = on1 = on2 = own = 0.0
-    for (t, x, w), value in zip(points, shape, strict=True):
+    for (t, x), value in zip(points, shape, strict=True):
         if value:
             u = t - line.middle_s
-            explained += w * value * (x - line.position_um(t))
-            on0 += w * value
-            on1 += w * value * u
-            on2 += w * value * line.bow(u)
-            own += w * value * value
+            explained += value * (x - line.position_um(t))
+            on0 += value
+            on1 += value * u
+            on2 += value * line.bow(u)
+            own += value * value
     own -= on0 * on0 / line.norm0 + on1 * on1 / line.norm1 + (on2 * on2 / line.norm2 if line.norm2 > 0.0 else 0.0)
     return explained * explained / own if own > 0.0 else 0.0

@@ -1,7 +1,7 @@
 """Velocity on line that does not smear corners: short straight fits which never reach across one.
 
 A corner is where the motion reverses, starts or ends. It is looked for as the broken line that explains the newest
-positions so much better than a straight one that noise does not.
+positions so much better than a straight one that noise does not, and with slopes that differ.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ _LOOK_BACK = 10
 _CORNER = 30.0
 """A corner explains as much as this many variances of one position; noise does so once in some 1e7 positions."""
 
+_LEAST_TURN = 0.4
+"""Of the faster of two speeds: what differs by less is one motion that slows down or gathers speed."""
+
 _SPIKE_SIGMAS = 5.0
-_ANCHOR_WEIGHT = 2.0
+_ANCHOR_WEIGHT = 2
 _REFINED = 8
 _LEAST_SIGMA_UM = 1e-3
 _FAR = 1_000_000
@@ -179,9 +182,9 @@ class LocalMotion:
         if line.left_um2 >= least_um2 and len(self._points) >= _BEFORE + self._beyond:
             at = self._suspect(line, least_um2)
             if at < len(self._points) - self._beyond:
-                motions = self._turn(*self._corner(line, at, least_um2))
+                motions = self._turn_near(line, at, least_um2)
                 line = self._fit(self._points)
-            elif at < len(self._points):
+            elif at < len(self._points) and self._bends(at):
                 line = self._fit([*self._points][: at + 1])
         self._speed_um_s = abs(line.slope)
         surplus = len(self._pending) - (self.settings.lag - 1)
@@ -200,16 +203,16 @@ class LocalMotion:
             clearance = corner_rank - 1 - rank
             motions.append(
                 Motion(
-                    t_ns=t_ns,
-                    position_um=line.position_um(t_s) if spike else x_um,
-                    sigma_um=sigma_um,
-                    velocity_um_s=line.velocity_um_s(t_s),
-                    velocity_sigma_um_s=sigma_um * line.velocity_spread_per_s(t_s),
-                    acceleration_um_s2=2.0 * line.bend,
-                    begin_ns=self._begin_ns,
-                    after_corner=self._after_corner,
-                    clearance=min(clearance, rank) if self._after_corner else clearance,
-                    spike=spike,
+                    t_ns,
+                    line.position_um(t_s) if spike else x_um,
+                    sigma_um,
+                    line.velocity_um_s(t_s),
+                    sigma_um * line.velocity_spread_per_s(t_s),
+                    2.0 * line.bend,
+                    self._begin_ns,
+                    self._after_corner,
+                    min(clearance, rank) if self._after_corner else clearance,
+                    spike,
                 )
             )
         return motions
@@ -224,23 +227,26 @@ class LocalMotion:
         best = max(gains)
         return newest - gains.index(best) if best >= least_um2 else len(points)
 
-    def _corner(self, line: Fit, at: int, least_um2: float) -> tuple[float, bool]:
-        """Instant of the corner near a point, and whether it is a jump instead, by a clear margin."""
+    def _bends(self, at: int) -> bool:
+        """Whether the slopes on either side of a point differ as at a reversal, a start or a stop."""
+        points = [*self._points]
+        before, after = fit(points[: at + 1]).slope, fit(points[at:]).slope
+        return abs(after - before) >= _LEAST_TURN * max(abs(after), abs(before))
+
+    def _turn_near(self, line: Fit, at: int, least_um2: float) -> list[Motion]:
+        """Turn at the corner near a point, or at a jump if that explains clearly more; there may be neither."""
         points = self._points
         begin_s, end_s = points[at - 1].t_s, points[at + 1].t_s
-        best, corner_s = -1.0, begin_s
-        for step in range(_REFINED + 1):
-            instant_s = begin_s + (end_s - begin_s) * step / _REFINED
-            gain = shape_gain(points, line, [max(point.t_s - instant_s, 0.0) for point in points])
-            if gain > best:
-                best, corner_s = gain, instant_s
-        for j in range(at - 1, at + 2):
-            gain = shape_gain(points, line, [1.0 if i > j else 0.0 for i in range(len(points))])
-            if gain > best + least_um2:
-                return points[j].t_s, True
-        return corner_s, False
+        instants = [begin_s + (end_s - begin_s) * step / _REFINED for step in range(_REFINED + 1)]
+        gains = [shape_gain(points, line, [max(t_s - instant, 0.0) for t_s, _ in points]) for instant in instants]
+        jumps = [
+            shape_gain(points, line, [1.0 if i > j else 0.0 for i in range(len(points))]) for j in (at - 1, at, at + 1)
+        ]
+        if max(jumps) > max(gains) + least_um2:
+            return self._turn(points[at - 1 + jumps.index(max(jumps))].t_s, jump=True)
+        return self._turn(instants[gains.index(max(gains))], jump=False) if self._bends(at) else []
 
-    def _turn(self, corner_s: float, jump: bool) -> list[Motion]:
+    def _turn(self, corner_s: float, *, jump: bool) -> list[Motion]:
         """Tell what lies before a corner, and begin a new motion there."""
         assert self._zero_ns is not None
         old = [point for point in self._points if point.t_s <= corner_s]
@@ -251,7 +257,7 @@ class LocalMotion:
         motions = self._settle(past, line, corner_rank)
         self._points.clear()
         if not jump:
-            self._points.append(Point(corner_s, line.position_um(corner_s), _ANCHOR_WEIGHT))
+            self._points.extend([Point(corner_s, line.position_um(corner_s))] * _ANCHOR_WEIGHT)
         self._points.extend(new)
         self._pending = deque(p._replace(rank=p.rank - corner_rank) for p in self._pending)
         self._count -= corner_rank

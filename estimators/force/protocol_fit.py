@@ -14,7 +14,6 @@ from microdrivers.estimators.force.joint import (
     CONTACT_S,
     K1,
     K2,
-    MASS,
     RATE,
     SLIP,
     Motion,
@@ -43,7 +42,7 @@ class ProtocolFit:
     Attributes:
         name: of the protocol.
         k1_uN_per_um, k2_uN_per_um3, b_loading_uN_s_per_um, b_unloading_uN_s_per_um: springs and damper.
-        m_kg: mass; None where the record does not support one: at constant speed it never does.
+        m_kg: mass; None, as no record at constant speed supports one. `weak` says which mass would have shown.
         contact_um: where x = 0 lies in the deformation's own coordinate. contact_time_s: when it was touched.
         slip_um, slip_rate_per_s: offset and α of eq. (26); 0 unless the protocol has them.
         covariance: 3 × 3, of (k1, k2, b_loading) in these units.
@@ -143,7 +142,6 @@ def weak_parameters(
     motion: Motion,
     *,
     slips: bool,
-    mass: bool,
     structured_uN: float,
 ) -> dict[str, str]:
     """Reasons why the record does not determine a parameter, for those that it does not.
@@ -154,7 +152,6 @@ def weak_parameters(
         covariance: of them.
         motion: of the samples that the protocol is judged by.
         slips: offset and α were estimated.
-        mass: the mass was estimated.
         structured_uN: RMS of what the model does not explain; a parameter may be off by as much as explains this.
     """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -177,13 +174,18 @@ def weak_parameters(
             why.append(_confounded(prepared, theta, covariance, sigma))
         if why:
             reasons[name] = "; ".join(part for part in why if part)
-    if not mass:
-        acceleration = float(np.sqrt(np.mean(a**2)))
-        reasons["m"] = (
-            f"the acceleration is {acceleration:.2g} µm/s² RMS in the samples used: at constant speed a mass leaves no "
-            "trace in the force"
-        )
+    reasons["m"] = _no_mass(prepared, a)
     return reasons
+
+
+def _no_mass(prepared: Prepared, acceleration_um_s2: Array) -> str:
+    """At constant speed a mass leaves no trace: say how large it would have to be."""
+    least = INTERVAL * prepared.force_sigma_uN / max(float(np.sqrt(np.sum(acceleration_um_s2**2))), 1e-12)
+    typical = float(np.sqrt(np.mean(acceleration_um_s2**2)))
+    return (
+        f"a mass shows in accelerations only, {typical:.2g} µm/s² RMS in the samples used: one below {least:.2g} kg "
+        "leaves no trace in the force"
+    )
 
 
 def _confounded(prepared: Prepared, theta: Array, covariance: Array, sigma: Array) -> str:
@@ -204,11 +206,6 @@ def _confounded(prepared: Prepared, theta: Array, covariance: Array, sigma: Arra
         f"{begins}at constant speed b·v cannot be told from the contact point: known to ±{INTERVAL * known:.2g} µm, "
         f"that alone is ±{shift:.2g} µN·s/µm of b"
     )
-
-
-def mass_of(theta: Array, mass: bool) -> float | None:
-    """The mass where it was estimated."""
-    return float(theta[MASS]) if mass else None
 
 
 def parameter_covariance(covariance: Array) -> Array:

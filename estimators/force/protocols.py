@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from microdrivers.estimators.force.joint import B_LOADING, B_UNLOADING, K1, K2, MASS, RATE, SLIP, Solution
+from microdrivers.estimators.force.joint import B_LOADING, B_UNLOADING, K1, K2, RATE, SLIP, Solution
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import HOLD, LOADING, UNLOADING, Indices
 
@@ -29,11 +29,6 @@ UNDAMPED_RETURN = Protocol((K1, K2, B_LOADING), _ALL)
 SPRINGS_OF_UNLOADING = Protocol((K1, K2), (UNLOADING,))
 LOADING_ALONE = Protocol((K1, K2, B_LOADING), (LOADING,))
 SLIP_CORRECTED = Protocol((K1, K2, B_LOADING, SLIP, RATE), _ALL)
-
-
-def with_mass(protocol: Protocol) -> Protocol:
-    """The same, with the mass estimated."""
-    return protocol._replace(groups=(*protocol.groups, MASS))
 
 
 class Fit(NamedTuple):

@@ -38,19 +38,21 @@ class RecursionSettings(NamedTuple):
         lag, window: samples that must follow one, and those in the fit of its velocity; see `MotionSettings`.
         max_gap_s: samples further apart than this give no velocity across the gap.
         least_share: a force below this share of the largest is not used: the tool may have left the specimen.
+        baseline_sigma_uN: the force before contact is taken to scatter by this at least; see `ForceOnset`.
     """
 
     forgetting: float = 0.999
     branch_forgetting: float = 0.0
     separate_branches: bool = False
     with_mass: bool = False
-    ridge: float = 1e-9
+    ridge: float = 1e-11
     scales: Scales = Scales()
     clearance: int = 8
     lag: int = 13
     window: int = 25
     max_gap_s: float = 0.25
     least_share: float = 0.01
+    baseline_sigma_uN: float = 0.01
 
 
 class SpecimenRecursion:
@@ -83,7 +85,7 @@ class SpecimenRecursion:
         self.late_samples = 0
         self.excluded_samples = 0
         self.contact: Contact | None = None
-        self._onset = ForceOnset() if contact_um is None else None
+        self._onset = ForceOnset(least_sigma_uN=chosen.baseline_sigma_uN) if contact_um is None else None
         if contact_um is not None:
             self.contact = Contact(t_ns=-1, contact_um=contact_um, baseline_uN=0.0, sigma_uN=0.0)
         self._motion = LocalMotion(

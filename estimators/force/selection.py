@@ -8,7 +8,7 @@ import numpy as np
 
 from microdrivers.estimators.force.fit_motion import deformation_alone_fits, motion_of_branch, unseen_force_uN
 from microdrivers.estimators.force.fitting import fit_protocol, fit_unloading_springs
-from microdrivers.estimators.force.joint import B_LOADING, B_UNLOADING, MASS, force_of
+from microdrivers.estimators.force.joint import B_LOADING, B_UNLOADING, force_of
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import LOADING, UNLOADING, Margins, Prepared, prepare
 from microdrivers.estimators.force.protocols import (
@@ -19,7 +19,6 @@ from microdrivers.estimators.force.protocols import (
     Fit,
     Protocol,
     ProtocolName,
-    with_mass,
 )
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.force.trajectory import KNOT_SPACINGS_S, RAMP
@@ -33,8 +32,7 @@ _STILL_SETTLING = 5.0
 """Time constants between where the noise begins to hide that a speed settles, and where it has settled."""
 
 _BEYOND_NOISE = 4.0
-_CLEAR_MASS = 5.0
-_UNSEEN = 5.0
+_UNSEEN = 3.0
 """Times what motion that the camera does not see can do to the force: more than that is not the trajectory's fault."""
 
 _PROTOCOLS: dict[ProtocolName, Protocol] = {
@@ -82,21 +80,19 @@ def all_protocols(prepared: Prepared, on_ramps: Mapping[ProtocolName, Fit]) -> F
         on_ramps: of protocols for all branches, on ramps.
     """
     fits = dict(on_ramps)
-    fallback = RAMP
+    spacing_s, found = RAMP, None
     if not _any_fits(fits):
         name = min(fits, key=lambda name: fits[name].discrepancy_uN)
-        found = _on_splines(prepared, _PROTOCOLS[name], fits[name])
         followed = (spacing_s for spacing_s in KNOT_SPACINGS_S if deformation_alone_fits(prepared, spacing_s))
-        fallback = next(followed, KNOT_SPACINGS_S[-1])
-        for other in fits if found is not None or fallback != RAMP else ():
-            fits[other] = _refitted(prepared, other, fits[other], found, fallback)
+        spacing_s = next(followed, KNOT_SPACINGS_S[-1])
+        found = _on_splines(prepared, _PROTOCOLS[name], fits[name], straight=spacing_s == RAMP)
+        if found is not None or spacing_s != RAMP:
+            fits = {key: _refitted(prepared, _PROTOCOLS[key], fit, found, spacing_s) for key, fit in fits.items()}
     if "single" in fits:
-        pooled = fits["unloading_springs"]
-        fits["unloading_springs"] = fit_unloading_springs(prepared, pooled, fallback)
-        best = min(fits.values(), key=lambda fit: fit.discrepancy_uN)
-        loading = fit_protocol(prepared, LOADING_ALONE, fallback)
-        if best.spacing_s != fallback and not loading.within_noise:
-            loading = _refitted(prepared, "loading", loading, best, fallback)
+        fits["unloading_springs"] = fit_unloading_springs(prepared, fits["unloading_springs"], spacing_s)
+        loading = fit_protocol(prepared, _PROTOCOLS["loading"], spacing_s)
+        if found is not None and not loading.within_noise:
+            loading = _refitted(prepared, _PROTOCOLS["loading"], loading, found, spacing_s)
         fits["loading_only"] = fits["loading"] = loading
     return fits
 
@@ -150,29 +146,23 @@ def _middle_of_three(values: Array) -> Array:
     return middle
 
 
-def _on_splines(prepared: Prepared, protocol: Protocol, on_ramps: Fit) -> Fit | None:
-    """On the stiffest splines on which a protocol leaves only noise, with a mass if it takes that; None if on none."""
-    straight = deformation_alone_fits(prepared, RAMP)
+def _on_splines(prepared: Prepared, protocol: Protocol, on_ramps: Fit, *, straight: bool) -> Fit | None:
+    """On the stiffest splines on which a protocol leaves only noise; None if on none.
+
+    Not even tried if the deformation follows ramps and the force is off by more than motion unseen could make it.
+    """
     if straight and on_ramps.discrepancy_uN > _UNSEEN * unseen_force_uN(prepared, on_ramps):
         return None
-    for spacing_s in KNOT_SPACINGS_S[1:]:
-        fit = fit_protocol(prepared, protocol, spacing_s, only_noise_from=on_ramps.theta)
-        if fit.within_noise:
-            return fit
-    # Where the deformation follows ramps there is no acceleration that a mass could show in.
-    for spacing_s in KNOT_SPACINGS_S[1:] if not straight else ():
-        heavy = fit_protocol(prepared, with_mass(protocol), spacing_s, only_noise_from=on_ramps.theta)
-        if heavy.within_noise and heavy.theta[MASS] > _CLEAR_MASS * np.sqrt(heavy.covariance[MASS, MASS]):
-            return heavy
-    return None
+    tried = (
+        fit_protocol(prepared, protocol, spacing_s, only_noise_from=on_ramps.theta) for spacing_s in KNOT_SPACINGS_S[1:]
+    )
+    return next((fit for fit in tried if fit.within_noise), None)
 
 
-def _refitted(prepared: Prepared, name: ProtocolName, on_ramps: Fit, found: Fit | None, fallback_s: float) -> Fit:
+def _refitted(prepared: Prepared, protocol: Protocol, on_ramps: Fit, found: Fit | None, spacing_s: float) -> Fit:
     """As `found` if that leaves only noise here too, else on the family that the deformation alone follows."""
-    protocol = _PROTOCOLS[name]
     if found is not None:
-        protocol = with_mass(protocol) if found.theta[MASS] else protocol
         fit = fit_protocol(prepared, protocol, found.spacing_s, only_noise_from=on_ramps.theta)
         if fit.within_noise:
             return fit
-    return fit_protocol(prepared, protocol, fallback_s)
+    return fit_protocol(prepared, protocol, spacing_s)

@@ -15,7 +15,15 @@ from microdrivers.core.samples import Frame
 from microdrivers.core.units import Range, check_range
 from microdrivers.estimators.vision.motion_segments import even_light
 from microdrivers.estimators.vision.moving_tip import TipView
-from microdrivers.estimators.vision.patch import MIN_PIXELS, BoolArray, Patch, locate, take_patch
+from microdrivers.estimators.vision.patch import (
+    MIN_PIXELS,
+    BoolArray,
+    Patch,
+    PatchMatch,
+    locate,
+    locate_along,
+    take_patch,
+)
 from microdrivers.estimators.vision.points import require_grey
 from microdrivers.estimators.vision.template import MARGIN_PX, Float32Array, FloatArray
 
@@ -31,6 +39,7 @@ _RIM_SHARE = 0.12
 _MIN_REACH_PX = 10.0
 _MIN_KEPT = 0.5
 _SATURATED_LEVELS = 2
+_MUCH_WHITE = 0.02
 _UNSTEADY_PX = 0.1
 
 _REMEDIES: dict[str, str] = {
@@ -117,7 +126,7 @@ def contact_patch(
     for name, value in (("rigid_um", rigid_um), ("depth_um", depth_um), ("search_um", search_um)):
         check_range(value, Range(1.0, 1e4), what=name, unit="µm")
     raw = [require_grey(frame.image) for frame in frames]
-    found = locate(tip.patch, raw[-1], np.zeros(2), radius_px=float(max(raw[-1].shape)))
+    found = _find_tip(tip, raw[-1], search_um)
     if found is None:
         raise NoContactPatch("no_tip", "the probe's tip is not seen in the frames of the undeformed specimen")
     images, noise = even_light(raw)
@@ -126,14 +135,17 @@ def contact_patch(
     gap = None if gap_um is None else gap_um * tip.scale_px_per_um
     if gap is None:
         gap = _gap_px(mean, front, tip, noise=noise / math.sqrt(len(raw)), search_px=search_um * tip.scale_px_per_um)
+    white = _white(mean, 2 ** frames[-1].bit_depth - 1)
+    if gap is None and white.mean() > _MUCH_WHITE:
+        raise NoContactPatch("saturated", "no texture ahead of the tip, and much of the image is white")
     if gap is None:
         raise NoContactPatch("no_specimen", f"no texture within {search_um:.0f} µm ahead of the tip")
     contact = front + gap * tip.direction
     reach = rigid_um * tip.scale_px_per_um
     if reach < _MIN_REACH_PX:
         raise NoContactPatch("too_small", f"{rigid_um:.0f} µm about the contact point are {reach:.1f} px only")
-    mask = _mask(mean, contact, tip.direction, reach, white=2 ** frames[-1].bit_depth - 1)
-    patch = take_patch(mean, mask, noise_share=1.0 / len(raw), pivot_px=contact)
+    mask = _mask(white, contact, tip.direction, reach)
+    patch = take_patch(mean, mask, noise_levels=noise, noise_share=1.0 / len(raw), pivot_px=contact)
     sigma = math.inf if patch is None else patch.sigma_px(noise, tip.direction)
     if patch is None or sigma > max_sigma_px:
         what = f"the displacement would be uncertain by {sigma:.2g} px a frame, more than {max_sigma_px:g} px"
@@ -142,6 +154,13 @@ def contact_patch(
         raise NoContactPatch("at_border", f"pressed in by {depth_um:.0f} µm, the contact point leaves the view")
     _require_rest(patch, raw)
     return ContactPatch(patch, contact, gap, found.shift, reach, noise, sigma)
+
+
+def _find_tip(tip: TipView, image: npt.NDArray[Any], search_um: float) -> PatchMatch | None:
+    """On its way first: there it is found even if the specimen lies at its front."""
+    reach_px = search_um * tip.scale_px_per_um
+    on_way = locate_along(tip.patch, image, tip.direction, back_px=0.5 * reach_px, ahead_px=reach_px)
+    return on_way or locate(tip.patch, image, np.zeros(2), radius_px=float(max(image.shape)))
 
 
 def _gap_px(image: Float32Array, front: FloatArray, tip: TipView, *, noise: float, search_px: float) -> float | None:
@@ -200,8 +219,14 @@ def _onset(
     return None
 
 
-def _mask(image: Float32Array, contact: FloatArray, direction: FloatArray, reach_px: float, *, white: int) -> BoolArray:
-    v, u = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float64)
+def _white(image: Float32Array, top_level: int) -> BoolArray:
+    """What is saturated, or so near to it that interpolation meets it."""
+    bright = (image >= top_level - _SATURATED_LEVELS).astype(np.uint8)
+    return np.asarray(cv2.dilate(bright, np.ones((5, 5), np.uint8)) > 0)
+
+
+def _mask(white: BoolArray, contact: FloatArray, direction: FloatArray, reach_px: float) -> BoolArray:
+    v, u = np.mgrid[0 : white.shape[0], 0 : white.shape[1]].astype(np.float64)
     du, dv = u - contact[0], v - contact[1]
     disc = (du * du + dv * dv <= reach_px**2) & (
         du * direction[0] + dv * direction[1] >= max(_RIM_PX, _RIM_SHARE * reach_px)
@@ -211,8 +236,7 @@ def _mask(image: Float32Array, contact: FloatArray, direction: FloatArray, reach
     inside[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] = True
     if (disc & inside).sum() < _MIN_KEPT * area:
         raise NoContactPatch("at_border", "most of the specimen about the contact point is out of view")
-    bright = cv2.dilate((image >= white - _SATURATED_LEVELS).astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    kept = disc & inside & ~bright
+    kept = disc & inside & ~white
     if kept.sum() < _MIN_KEPT * (disc & inside).sum():
         raise NoContactPatch("saturated", "most of the specimen about the contact point is white")
     if kept.sum() < MIN_PIXELS:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from microdrivers.core.errors import DataError, OutOfRange
 from microdrivers.core.samples import Frame
 from microdrivers.estimators.vision.motion_segments import changed_region, displacement_into, even_light
-from microdrivers.estimators.vision.patch import BoolArray, Patch, PatchMatch, take_patch
+from microdrivers.estimators.vision.patch import MIN_PIXELS, BoolArray, Patch, PatchMatch, take_patch
 from microdrivers.estimators.vision.points import require_grey
 from microdrivers.estimators.vision.template import MARGIN_PX, Float32Array, FloatArray, interpolated, interpolator
 from microdrivers.estimators.vision.tip_front import FLANK_PX, TipFront, find_front
@@ -29,6 +29,7 @@ _AHEAD_PX = 5.0
 _BEHIND_PX = 4.0
 _SUFFICIENT_PX = 0.02
 _BESIDE_PX = 3
+_SLACK_PX = 2
 _MAX_RESIDUAL_PX = 0.3
 _RESTLESS_SIGMAS = 3.0
 
@@ -115,8 +116,9 @@ def find_moving_tip(
         )
     share = (travel - travel[-1]) / (travel[-1] - travel[0])
     direction = vector / np.hypot(*vector)
+    region = _seen_throughout(region, vector)
     mask = _mask(region, find_front(images[-1], region, direction), direction)
-    first = _require_patch(take_patch(images[-1], mask, noise_share=1.0))
+    first = _require_patch(take_patch(images[-1], mask, noise_levels=noise, noise_share=1.0))
     shifts = _follow(first, images, share[:, None] * vector, radius_px=4.0 + 0.1 * length_px)
     mean, noise_share, restless = _mean_image(images, shifts, mask, noise)
     front = find_front(mean, region, direction)
@@ -138,11 +140,11 @@ def _choose_patch(
     """The tip without its front, if its own marks or shape suffice; else with it, whatever comes to lie ahead."""
     mask = _mask(region, front, direction) & ~restless
     behind = mask & (front.along(direction, mask.shape) < -_BEHIND_PX)
-    plain = take_patch(image, behind, noise_share=noise_share)
+    plain = take_patch(image, behind, noise_levels=noise_levels, noise_share=noise_share)
     if plain is not None and plain.sigma_px(noise_levels, direction) < _SUFFICIENT_PX:
         return plain
     ahead = front.ahead(direction, mask.shape)
-    return _require_patch(take_patch(image, mask, noise_share=noise_share, nuisance=ahead))
+    return _require_patch(take_patch(image, mask, noise_levels=noise_levels, noise_share=noise_share, nuisance=ahead))
 
 
 def _check(frames: Sequence[Frame], travel: FloatArray, scale_hint: float) -> float:
@@ -176,9 +178,19 @@ def _mask(region: BoolArray, front: TipFront, direction: FloatArray) -> BoolArra
     mask = cv2.dilate(region.astype(np.uint8), kernel).astype(bool)
     along = front.along(direction, mask.shape)
     mask &= (along > -_KEPT_BEHIND_PX) & (along < _AHEAD_PX)
-    mask[:MARGIN_PX] = mask[-MARGIN_PX:] = False
-    mask[:, :MARGIN_PX] = mask[:, -MARGIN_PX:] = False
     return np.asarray(mask)
+
+
+def _seen_throughout(region: BoolArray, vector: FloatArray) -> BoolArray:
+    """The part of the region that was in view already before it moved by `vector`, its surroundings too."""
+    margin = MARGIN_PX + _BESIDE_PX + _SLACK_PX
+    v, u = np.mgrid[0 : region.shape[0], 0 : region.shape[1]]
+    seen = np.ones_like(region)
+    for places, part, size in ((u, vector[0], region.shape[1]), (v, vector[1], region.shape[0])):
+        seen &= (places - max(0.0, part) >= margin) & (places - min(0.0, part) < size - margin)
+    if int((region & seen).sum()) < MIN_PIXELS:
+        raise NoMovingTip("at_border", "the tip had hardly come into view in the first frames")
+    return np.asarray(region & seen)
 
 
 def _follow(
@@ -190,8 +202,6 @@ def _follow(
         match = None if place is None else patch.refine(image, place.astype(np.float64))
         matches.append(match if match is not None and match.correlation >= _MIN_CORRELATION else None)
     if sum(match is not None for match in matches) < MIN_FRAMES:
-        if sum(patch.fits_in(image.shape, shift) for image, shift in zip(images, expected, strict=True)) < MIN_FRAMES:
-            raise NoMovingTip("at_border", "the tip had hardly come into view in the first frames")
         raise NoMovingTip("does_not_follow", "the tip is not where its travel should have taken it in most frames")
     return matches
 

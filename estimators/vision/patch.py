@@ -37,6 +37,7 @@ _ROUNDING_VARIANCE = 1.0 / 12.0
 _PLAIN = np.eye(4)
 _SEARCH_SIZE_PX = 200
 _LEAST_SEARCHED_PX = 8
+_CANDIDATES = 5
 _DERIVATIVE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
 """Of the cubic through five pixels; right within 1 % down to wavelengths of 8 px."""
 
@@ -72,6 +73,7 @@ class Patch:
         *,
         corner: tuple[int, int],
         pivot_px: FloatArray,
+        noise_levels: float,
         noise_share: float,
         nuisance: FloatArray | None,
     ) -> None:
@@ -85,11 +87,15 @@ class Patch:
         self._noise_share = noise_share
         rows = _model_rows(image, mask, self._corner, nuisance)
         self._rows = rows
-        self._normal = rows @ rows.T
+        self._products = rows @ rows.T
+        self._normal = _without_noise(self._products, noise_share * noise_levels**2, self.pixels)
         self._inverse = _inverse(self._normal[:4, :4])
         self._spread = self._inverse[:2, :2]
+        self._score_inverse = _inverse(self._normal[:5, :5])
         stretched = np.vstack([rows[:4], _stretch_rows(rows[:2], mask, pivot_px - self._corner)])
-        full_inverse = _inverse(stretched @ stretched.T)
+        full_products = stretched @ stretched.T
+        full_products[:4, :4] = self._normal[:4, :4]
+        full_inverse = _inverse(full_products)
         self._stretched_projection = full_inverse[:2] @ stretched
         self._stretched_excess = full_inverse[:2, :2] - self._spread
 
@@ -125,6 +131,15 @@ class Patch:
             upper = np.minimum(place + reduction + 1 + self._size, np.array(image.shape[::-1]) - margin)
             place = low + self._best_place(image[low[1] : upper[1], low[0] : upper[0]], 1)
         return np.asarray(place - self._corner)
+
+    def score(self, image: npt.NDArray[Any], shift: FloatArray) -> float:
+        """Correlation at a shift that is right within about 1 px, without fitting it; 0 outside the image."""
+        if not self.fits_in(image.shape, shift):
+            return 0.0
+        sampled, _ = self._sample(image, shift)
+        products = product(self._rows, sampled)[: len(self._score_inverse)]
+        weights = self._score_inverse @ products
+        return _correlation(sampled, float(weights @ products)) if weights[2] > 0.0 else 0.0
 
     def refine(self, image: npt.NDArray[Any], shift: FloatArray) -> PatchMatch | None:
         """Fit shift, gain and bias from `shift` on; None if the fit runs away or leaves the image."""
@@ -171,17 +186,18 @@ class Patch:
         shift: FloatArray,
         part: FloatArray,
     ) -> PatchMatch:
-        count, gain = len(sampled), float(weights[2])
-        squares = float((sampled * sampled).sum()) - float(weights @ products)
-        total = float((sampled * sampled).sum()) - float(sampled.sum()) ** 2 / count
+        gain = float(weights[2])
+        count = len(weights)
+        unexplained = float(weights @ self._products[:count, :count] @ weights) - 2.0 * float(weights @ products)
+        squares = float((sampled * sampled).sum()) + unexplained
         # Interpolation evens out a part of the noise that the residuals show, but not of what moves the fit.
         smoothing = math.prod(float((interpolator(x) ** 2).sum()) for x in part.tolist())
-        noise = max(squares / (count - len(weights)) / (smoothing + self._noise_share), _ROUNDING_VARIANCE)
+        noise = max(squares / (len(sampled) - count) / (smoothing + self._noise_share), _ROUNDING_VARIANCE)
         variance = noise * (1.0 + self._noise_share) / gain**2
         return PatchMatch(
             shift=shift,
             covariance=variance * spread,
-            correlation=math.sqrt(min(1.0, max(0.0, 1.0 - squares / total))) if total > 0.0 else 0.0,
+            correlation=_correlation(sampled, -unexplained),
             unrigid=-product(self._stretched_projection, sampled) / gain,
             unrigid_covariance=variance * self._stretched_excess,
         )
@@ -201,6 +217,7 @@ def take_patch(
     image: Float32Array,
     mask: BoolArray,
     *,
+    noise_levels: float,
     noise_share: float,
     pivot_px: FloatArray | None = None,
     nuisance: FloatArray | None = None,
@@ -210,6 +227,7 @@ def take_patch(
     Args:
         image: grey levels, rows × columns; a mean of several images makes a better patch than one.
         mask: which pixels belong to the patch, as large as the image.
+        noise_levels: standard deviation of the noise of the frames to come.
         noise_share: variance of the noise in `image` over that of the frames to come: 1/n for a mean of n frames.
         pivot_px: the point (u, v) whose shift is wanted, for `PatchMatch.unrigid`; the middle of the patch if None.
         nuisance: levels, as large as the image, of which any multiple may come on top of the patch.
@@ -222,11 +240,19 @@ def take_patch(
         return None
     window = (slice(low[1], high[1]), slice(low[0], high[0]))
     cut = None if nuisance is None else nuisance[window]
-    rows = _model_rows(image, mask[window], np.array(low, dtype=np.float64), cut)
-    if not _independent(rows[:5]):
+    rows = _model_rows(image, mask[window], np.array(low, dtype=np.float64), cut)[:5]
+    if not _independent(_without_noise(rows @ rows.T, noise_share * noise_levels**2, len(u))):
         return None
     pivot = np.array([u.mean(), v.mean()]) if pivot_px is None else pivot_px
-    return Patch(image, mask[window], corner=low, pivot_px=pivot, noise_share=noise_share, nuisance=cut)
+    return Patch(
+        image,
+        mask[window],
+        corner=low,
+        pivot_px=pivot,
+        noise_levels=noise_levels,
+        noise_share=noise_share,
+        nuisance=cut,
+    )
 
 
 def locate(
@@ -239,6 +265,30 @@ def locate(
     place = patch.search(image, expected, radius_px)
     match = None if place is None else patch.refine(image, place.astype(np.float64))
     return match if match is not None and match.correlation >= min_correlation else None
+
+
+def locate_along(
+    patch: Patch,
+    image: npt.NDArray[Any],
+    direction: FloatArray,
+    *,
+    back_px: float,
+    ahead_px: float,
+    min_correlation: float = 0.75,
+) -> PatchMatch | None:
+    """Find `patch` on a line through where it was taken, whatever lies ahead of it; None if it is not there."""
+    shifts = [step * direction for step in np.arange(-back_px, ahead_px + 1.0)]
+    scores = np.array([patch.score(image, shift) for shift in shifts])
+    matches = [patch.refine(image, shifts[k]) for k in np.argsort(scores)[-_CANDIDATES:].tolist()]
+    found = [match for match in matches if match is not None and match.correlation >= min_correlation]
+    return max(found, key=lambda match: match.correlation, default=None)
+
+
+def _correlation(sampled: FloatArray, explained: float) -> float:
+    """Of what was sampled with what the model explains of its sum of squares."""
+    mean_part = float(sampled.sum()) ** 2 / len(sampled)
+    total = float((sampled * sampled).sum()) - mean_part
+    return math.sqrt(min(1.0, max(0.0, (explained - mean_part) / total))) if total > 0.0 else 0.0
 
 
 def _model_rows(image: Float32Array, mask: BoolArray, corner: FloatArray, nuisance: FloatArray | None) -> FloatArray:
@@ -268,12 +318,25 @@ def _stretch_rows(derivatives: FloatArray, mask: BoolArray, pivot: FloatArray) -
     return np.stack([derivative * lever for derivative in derivatives for lever in (u - pivot[0], v - pivot[1])])
 
 
-def _independent(rows: FloatArray) -> bool:
-    lengths = np.sqrt((rows * rows).sum(axis=1))
-    if not lengths.min() > 0.0:
+def _without_noise(products: FloatArray, variance: float, pixels: int) -> FloatArray:
+    """What the products of the rows would be if the patch had no noise.
+
+    With it, a fit takes some of the patch for noise and the gain for too small. On a finite patch the gain depends on
+    the shift, so that the shift would be off too, by up to 0.01 px.
+    """
+    corrected = products.copy()
+    slope = float((_DERIVATIVE**2).sum())
+    for row, share in enumerate((slope, slope, 1.0)):
+        corrected[row, row] -= share * variance * pixels
+    return corrected
+
+
+def _independent(normal: FloatArray) -> bool:
+    diagonal = np.diag(normal)
+    if not diagonal.min() > 0.0:
         return False
-    unit = rows / lengths[:, None]
-    return bool(np.linalg.eigvalsh(unit @ unit.T)[0] > _MIN_INDEPENDENCE)
+    lengths = np.sqrt(diagonal)
+    return bool(np.linalg.eigvalsh(normal / np.outer(lengths, lengths))[0] > _MIN_INDEPENDENCE)
 
 
 def _inverse(normal: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from microdrivers.estimators.vision.template import FloatArray
 _HISTORY = 120
 _REST_FRAMES = 5
 _REST_GAP = 5
+_RISEN_SIGMAS = 5.0
 _BEGUN = 0.3
 _TOGETHER = 0.4
 _TOGETHER_SIGMAS = 4.0
@@ -52,7 +53,8 @@ class VisualContact:
     Args:
         threshold: of the sum; with slack 1, white noise exceeds 12 once in 1e9 frames.
         slack: deformation per frame, in standard deviations, that counts as none.
-        confirm_frames: frames after the touch, at least, from which the place is found; the event comes that late.
+        confirm_frames: how many frames in a row must show a deformation of more than five standard deviations, before
+            the event comes; the place is found from them.
         confirm_sigmas: deformation, in standard deviations, at least, at which it comes.
 
     Attributes:
@@ -82,6 +84,7 @@ class VisualContact:
         self._samples: deque[DeformationSample] = deque(maxlen=_HISTORY)
         self._sum = 0.0
         self._moving = 0
+        self._risen = 0
 
     def update(self, sample: DeformationSample) -> ContactEvent | None:
         """Take the next sample; returns the touch once, with the sample that confirms it."""
@@ -95,16 +98,14 @@ class VisualContact:
         sigma = math.hypot(sample.sigma_um, rest_sigma)
         self._sum = max(0.0, self._sum + (sample.deformation_um - rest) / sigma - self._slack)
         self._moving = self._moving + 1 if self._sum > 0.0 else 0
-        if (
-            self._sum < self._threshold
-            or self._moving < self._confirm_frames
-            or sample.deformation_um - rest < self._confirm_sigmas * sigma
-        ):
+        risen = (sample.deformation_um - rest) / sigma
+        self._risen = self._risen + 1 if risen > _RISEN_SIGMAS else 0
+        if self._sum < self._threshold or self._risen < self._confirm_frames or risen < self._confirm_sigmas:
             return None
         self.event = self._place(rest, rest_sigma)
         if self.event is None:
             self._samples.clear()
-            self._sum, self._moving = 0.0, 0
+            self._sum, self._moving, self._risen = 0.0, 0, 0
         return self.event
 
     def _rest(self, resting: int) -> tuple[float, float]:
@@ -120,10 +121,13 @@ class VisualContact:
         tip = np.array([sample.tip_um for sample in recent])
         deformation = np.array([sample.deformation_um for sample in recent]) - rest
         variance = np.array([sample.sigma_um**2 + sample.tip_sigma_um**2 for sample in recent])
+        allowance = _TOGETHER_SIGMAS * math.sqrt(2.0 * float(variance[-1]))
+        came = float(tip[-1]) - self._samples[-1 - self._moving].tip_um
+        if came < (1.0 - _TOGETHER) * deformation[-1] - allowance:
+            return None
         begun = int(np.argmax(deformation > _BEGUN * deformation[-1]))
-        risen = float(deformation[-1] - deformation[begun])
-        excess = abs(float(tip[-1] - tip[begun]) - risen)
-        if excess > _TOGETHER * risen + _TOGETHER_SIGMAS * math.sqrt(variance[-1]):
+        further = float(deformation[-1] - deformation[begun])
+        if abs(float(tip[-1] - tip[begun]) - further) > _TOGETHER * abs(further) + allowance:
             return None
         place = float((tip - deformation)[begun:].mean())
         after = tip > place

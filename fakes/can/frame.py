@@ -8,6 +8,8 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
+import msgspec
+
 from microdrivers.core.errors import OutOfRange
 
 INTERFRAME_BITS = 3
@@ -26,7 +28,7 @@ _CRC_BITS = 15
 _TAIL_BITS = 10  # CRC delimiter, acknowledge slot and delimiter, end of frame (7): never stuffed
 
 
-class Frame(NamedTuple):
+class Frame(msgspec.Struct, frozen=True, gc=False):
     """One data or remote frame.
 
     Attributes:
@@ -40,7 +42,7 @@ class Frame(NamedTuple):
     remote: bool = False
 
 
-class Due(NamedTuple):
+class Due(msgspec.Struct, frozen=True, gc=False):
     """A frame that a node sends, and the earliest time at which it competes for the bus."""
 
     t_ns: int

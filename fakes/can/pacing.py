@@ -93,9 +93,9 @@ class SimulatedPacer:
         clock, calls = self._clock, self._calls
         self._pending.pop()
         self._will_ask = True
+        now_ns = clock.now_ns()
         try:
             while not self._closed:
-                now_ns = clock.now_ns()
                 while calls and calls[0][0] <= now_ns:
                     heappop(calls)[2](now_ns)
                 last_ns = clock.free_until_ns() - 1
@@ -106,6 +106,8 @@ class SimulatedPacer:
                     due_ns = calls[0][0]
                 if due_ns == NEVER_NS or not clock.go_on_at(due_ns):
                     return
+                if due_ns > now_ns:
+                    now_ns = due_ns
         finally:
             self._ask_clock()
 

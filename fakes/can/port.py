@@ -260,7 +260,7 @@ class Port:
         """A frame has arrived, from `start_ns` to `end_ns`; the host can read it from `ready_ns` on."""
         if not self.readable and not error:
             frame, error, own = PROTOCOL_ERROR, True, False
-        if self._failure is not None or start_ns < self._opened_ns:
+        if start_ns < self._opened_ns or self._failure is not None:
             return
         if self._filters and not (error or own or self._accepts(frame)):
             return
@@ -320,17 +320,19 @@ class Port:
 
     def _hand_over(self, now_ns: int) -> None:
         """The same for the one to whom everything is delivered."""
-        while self._received and self._received[0][0] <= now_ns:
-            self._give(self._received.popleft())
+        received = self._received
+        while received and received[0][0] <= now_ns:
+            self._give(received.popleft())
         if self._failure is not None:
             self._lost(self._failure)
 
     def _give(self, received: _Received) -> None:
-        _, t_ns, (identifier, data, extended, remote), error, _ = received
-        if extended or remote or error:
-            identifier |= extended * EXTENDED_FLAG | remote * REMOTE_FLAG | error * ERROR_FLAG
+        _, t_ns, frame, error, _ = received
+        identifier = frame.id
+        if error or frame.extended or frame.remote:
+            identifier |= frame.extended * EXTENDED_FLAG | frame.remote * REMOTE_FLAG | error * ERROR_FLAG
         if self._take is not None:
-            self._take(identifier, data, t_ns)
+            self._take(identifier, frame.data, t_ns)
 
     def _check(self) -> None:
         failure = self._failure

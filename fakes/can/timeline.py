@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Container, Sequence
 from heapq import heapify, heappop, heappush
 from typing import Final, Protocol
@@ -60,6 +61,7 @@ class BusTimeline:
         bit_ns = NS_PER_S / bitrate
         self.interframe_ns: int = round(INTERFRAME_BITS * bit_ns)
         self._times_ns: list[int] = [round(bits * bit_ns) for bits in range(MOST_BITS + 1)]
+        self._error_ns = self._times_ns[ERROR_FRAME_BITS]
         self._on_passed = on_passed
         self._nodes: list[CanNode] = []
         self._listens_to: list[Container[int]] = []
@@ -68,10 +70,9 @@ class BusTimeline:
         self._next_node_ns = NEVER_NS
         self._future: list[tuple[int, _Offer]] = []  # heap by time; they compete later
         self._waiting: list[_Offer] = []  # heap by rank; they have competed and lost
-        self._number = 0
+        self._next_number = itertools.count().__next__
         self._current: _Offer | None = None
-        self._start_ns = self._end_ns = 0
-        self._free_ns = 0
+        self._end_ns = -self.interframe_ns  # of the frame on the bus, or of the last one
         self._horizon_ns = 0  # when something has happened last
         self._playing = False
 
@@ -109,10 +110,9 @@ class BusTimeline:
             OutOfRange: it is no classic frame.
         """
         rank, bits = frame_shape(frame)
-        self._number = number = self._number + 1
-        duration_ns = self._times_ns[bits if readable else ERROR_FRAME_BITS]
+        duration_ns = self._times_ns[bits] if readable else self._error_ns
         ready_ns = t_ns if t_ns > self._horizon_ns else self._horizon_ns
-        heappush(self._future, (ready_ns, (rank, number, frame, sender, readable, duration_ns)))
+        heappush(self._future, (ready_ns, (rank, self._next_number(), frame, sender, readable, duration_ns)))
 
     def withdraw(self, sender: object, t_ns: int) -> None:
         """Take back all frames of a sender, also the one that is on the bus."""
@@ -122,7 +122,7 @@ class BusTimeline:
         heapify(self._waiting)
         if self._current is not None and self._current[_SENDER] is sender:
             self._current = None
-            self._free_ns = max(t_ns, self._horizon_ns) + self.interframe_ns
+            self._end_ns = max(t_ns, self._horizon_ns)
 
     def disturb(self, t_ns: int) -> object:
         """An error frame, now; the frame that it destroys competes again. Returns whose that was, or None."""
@@ -131,15 +131,14 @@ class BusTimeline:
         if hit is not None and sender is not None:
             heappush(self._waiting, hit)
         self._horizon_ns = now_ns
-        self._occupy((0, 0, _NOBODYS_ERROR, None, False, self._times_ns[ERROR_FRAME_BITS]), now_ns)
+        self._current, self._end_ns = (0, 0, _NOBODYS_ERROR, None, False, self._error_ns), now_ns + self._error_ns
         return sender
 
     # ------------------------------------------------------------------ time
 
     def duration_ns(self, frame: Frame | None) -> int:
         """What a frame takes on the bus, without the interframe space; None is an error frame."""
-        bits = ERROR_FRAME_BITS if frame is None else frame_shape(frame)[1]
-        return self._times_ns[bits]
+        return self._error_ns if frame is None else self._times_ns[frame_shape(frame)[1]]
 
     @property
     def last_event_ns(self) -> int:
@@ -182,12 +181,12 @@ class BusTimeline:
         return self.next_event_ns()
 
     def _next_start_ns(self) -> int:
-        if self._waiting:
-            return self._free_ns
-        if self._future:
-            ready_ns = self._future[0][0]
-            return ready_ns if ready_ns > self._free_ns else self._free_ns
-        return NEVER_NS
+        if not (self._waiting or self._future):
+            return NEVER_NS
+        free_ns = self._end_ns + self.interframe_ns
+        if not self._waiting and self._future[0][0] > free_ns:
+            return self._future[0][0]
+        return free_ns
 
     def _begin(self, t_ns: int) -> None:
         """Arbitrate among what is ready by `t_ns`."""
@@ -198,28 +197,24 @@ class BusTimeline:
             while future and future[0][0] <= t_ns:
                 heappush(waiting, heappop(future)[1])
             winner = heappop(waiting)
-        self._occupy(winner, t_ns if t_ns > self._free_ns else self._free_ns)
-
-    def _occupy(self, entry: _Offer, start_ns: int) -> None:
-        self._current = entry
-        self._start_ns = start_ns
-        self._end_ns = end_ns = start_ns + entry[_DURATION]
-        self._free_ns = end_ns + self.interframe_ns
+        free_ns = self._end_ns + self.interframe_ns
+        self._current, self._end_ns = winner, (t_ns if t_ns > free_ns else free_ns) + winner[_DURATION]
 
     def _end(self, entry: _Offer) -> None:
-        _, _, frame, sender, intact, _ = entry
+        _, _, frame, sender, intact, duration_ns = entry
         end_ns = self._horizon_ns = self._end_ns
         self._current = None
-        self._on_passed(sender, frame, self._start_ns, end_ns, intact)
+        self._on_passed(sender, frame, end_ns - duration_ns, end_ns, intact)
         if intact:
-            concerned = self._routes.get(frame.id)
+            identifier = frame.id
+            concerned = self._routes.get(identifier)
             if concerned is None or self._next_node_ns <= end_ns:
-                concerned = self._concerned(frame.id, end_ns)
+                concerned = self._concerned(identifier, end_ns)
             for index in concerned:
                 node = self._nodes[index]
                 if node is not sender:
-                    for due_ns, answer in node.receive(frame, end_ns):
-                        self.offer(node, answer, due_ns)
+                    for due in node.receive(frame, end_ns):
+                        self.offer(node, due.frame, due.t_ns)
                     self._look_at(index)
         if self._waiting or (self._future and self._future[0][0] <= end_ns):
             self._begin(end_ns)
@@ -235,8 +230,8 @@ class BusTimeline:
     def _advance(self, index: int, t_ns: int) -> None:
         node = self._nodes[index]
         self._horizon_ns = max(t_ns, self._horizon_ns)
-        for due_ns, frame in node.advance(self._horizon_ns):
-            self.offer(node, frame, due_ns)
+        for due in node.advance(self._horizon_ns):
+            self.offer(node, due.frame, due.t_ns)
         self._look_at(index)
 
     def _look_at(self, index: int) -> None:

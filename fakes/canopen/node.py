@@ -119,7 +119,7 @@ class CanOpenNode:
         if handler is not None and not frame.extended and not frame.remote:
             self._now_ns = t_ns
             moved = handler(frame, t_ns)
-            if self._transmit.sends_changes:
+            if self._transmit.cycle_ns is not None:
                 self._transmit.look(t_ns)
                 moved = True
             if moved:
@@ -289,11 +289,12 @@ class CanOpenNode:
     # ------------------------------------------------------------------ data
 
     def _sdo_request(self, frame: Frame, t_ns: int) -> bool:
-        was_under_way = self._sdo.deadline_ns is not None
-        reply = self._sdo.request(frame.data, t_ns)
+        server, request = self._sdo, frame.data
+        before = server.transfer
+        reply = server.request(request, t_ns)
         if reply is not None:
             self._reply(reply, t_ns)
-        return not is_upload(frame.data) or was_under_way or self._sdo.deadline_ns is not None
+        return before is not None or server.transfer is not None or not is_upload(request)
 
     def _sync(self, _frame: Frame, t_ns: int) -> bool:
         self._transmit.at_sync(t_ns)

@@ -37,11 +37,15 @@ def is_upload(request: bytes) -> bool:
 
 
 class SdoServer:
-    """Answers requests; one transfer at a time, a new one takes the place of a half one."""
+    """Answers requests; one transfer at a time, a new one takes the place of a half one.
+
+    Attributes:
+        transfer: the one that is under way in segments.
+    """
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self._dictionary = dictionary
-        self._transfer: _Transfer | None = None
+        self.transfer: _Transfer | None = None
 
     def request(self, data: bytes, t_ns: int) -> bytes | None:
         """The reply to a request that was received at `t_ns`; None if there is none (an abort, not 8 bytes)."""
@@ -56,46 +60,46 @@ class SdoServer:
             if command & 0xE0 in (0x60, 0x00):
                 return self._next_segment(data, t_ns)
             if command == _ABORT:
-                self._transfer = None
+                self.transfer = None
                 return None
             raise SdoAbort(AbortCode.UNKNOWN_SPECIFIER)
         except SdoAbort as refusal:
             multiplexor = data[1:4]
             if command & 0xE0 in (0x60, 0x00):
-                multiplexor = bytes(3) if self._transfer is None else self._transfer.multiplexor
-            self._transfer = None
+                multiplexor = bytes(3) if self.transfer is None else self.transfer.multiplexor
+            self.transfer = None
             return _abort(multiplexor, refusal.code)
 
     def cancel(self) -> None:
         """Forget a half transfer."""
-        self._transfer = None
+        self.transfer = None
 
     @property
     def deadline_ns(self) -> int | None:
         """When a half transfer is aborted."""
-        return None if self._transfer is None else self._transfer.deadline_ns
+        return None if self.transfer is None else self.transfer.deadline_ns
 
     def time_out(self) -> bytes:
         """Give a half transfer up; what is to be sent."""
-        assert self._transfer is not None
-        multiplexor, self._transfer = self._transfer.multiplexor, None
+        assert self.transfer is not None
+        multiplexor, self.transfer = self.transfer.multiplexor, None
         return _abort(multiplexor, AbortCode.TIMED_OUT)
 
     # ------------------------------------------------------------------ initiate
 
     def _begin_upload(self, data: bytes, t_ns: int) -> bytes:
-        self._transfer = None
+        self.transfer = None
         entry = self._dictionary.find(data[1] | data[2] << 8, data[3])
         value = entry.upload(t_ns)
         size = len(value)
         multiplexor = data[1:4]
         if 0 < size <= 4:
             return bytes((0x43 | (4 - size) << 2,)) + multiplexor + value + bytes(4 - size)
-        self._transfer = _Transfer(multiplexor, entry, True, t_ns + PATIENCE_NS, data=bytearray(value))
+        self.transfer = _Transfer(multiplexor, entry, True, t_ns + PATIENCE_NS, data=bytearray(value))
         return b"\x41" + multiplexor + size.to_bytes(4, "little")
 
     def _begin_download(self, data: bytes, t_ns: int) -> bytes:
-        self._transfer = None
+        self.transfer = None
         command, multiplexor = data[0], data[1:4]
         entry = self._dictionary.find(data[1] | data[2] << 8, data[3])
         expedited, sized = command & 2, command & 1
@@ -105,13 +109,13 @@ class SdoServer:
         else:
             announced = int.from_bytes(data[4:8], "little") if sized else None
             entry.check_download(announced)
-            self._transfer = _Transfer(multiplexor, entry, False, t_ns + PATIENCE_NS, size=announced)
+            self.transfer = _Transfer(multiplexor, entry, False, t_ns + PATIENCE_NS, size=announced)
         return b"\x60" + multiplexor + bytes(4)
 
     # ------------------------------------------------------------------ segments
 
     def _next_segment(self, data: bytes, t_ns: int) -> bytes:
-        transfer, command = self._transfer, data[0]
+        transfer, command = self.transfer, data[0]
         if transfer is None or transfer.upload != (command & 0xE0 == 0x60):
             raise SdoAbort(AbortCode.UNKNOWN_SPECIFIER)
         if command & 0x10 != transfer.toggle:
@@ -129,7 +133,7 @@ class SdoServer:
         transfer.done += len(piece)
         last = transfer.done == len(transfer.data)
         if last:
-            self._transfer = None
+            self.transfer = None
         unused = _SEGMENT - len(piece)
         return bytes((toggle | unused << 1 | last,)) + piece + bytes(unused)
 
@@ -142,7 +146,7 @@ class SdoServer:
             if announced is not None and len(transfer.data) < announced:
                 raise SdoAbort(AbortCode.TOO_SHORT)
             transfer.entry.download(bytes(transfer.data), t_ns)
-            self._transfer = None
+            self.transfer = None
 
 
 def _abort(multiplexor: bytes, code: AbortCode) -> bytes:

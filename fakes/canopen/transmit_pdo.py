@@ -142,6 +142,9 @@ class TransmitPdos:
     Args:
         send: puts a PDO on the bus, from (COB-ID, data, t_ns).
         changes_are_events: whether a changed value sends an event-driven PDO; else only its timer does.
+
+    Attributes:
+        cycle_ns: when it is looked next whether something has changed; None if a change sends nothing.
     """
 
     def __init__(self, pdos: Sequence[TransmitPdo], *, send: Send, changes_are_events: bool) -> None:
@@ -150,7 +153,7 @@ class TransmitPdos:
         self._changes_are_events = changes_are_events
         self._at_sync: list[TransmitPdo] = []
         self._by_event: list[TransmitPdo] = []
-        self._cycle_ns: int | None = None
+        self.cycle_ns: int | None = None
         self._running = False
 
     def start(self, t_ns: int) -> None:
@@ -163,7 +166,7 @@ class TransmitPdos:
     def stop(self) -> None:
         """It is so no longer."""
         self._running = False
-        self._at_sync, self._by_event, self._cycle_ns = [], [], None
+        self._at_sync, self._by_event, self.cycle_ns = [], [], None
 
     def sort(self, t_ns: int) -> None:
         """A PDO has been set to something else."""
@@ -172,7 +175,7 @@ class TransmitPdos:
         valid = [pdo for pdo in self._pdos if pdo.valid and pdo.mapped]
         self._at_sync = [pdo for pdo in valid if not pdo.event_driven]
         self._by_event = [pdo for pdo in valid if pdo.event_driven]
-        self._cycle_ns = t_ns + CYCLE_NS if self._by_event and self._changes_are_events else None
+        self.cycle_ns = t_ns + CYCLE_NS if self._by_event and self._changes_are_events else None
 
     def at_sync(self, t_ns: int) -> None:
         """A SYNC has ended: values of this instant are sent."""
@@ -181,14 +184,9 @@ class TransmitPdos:
             if data is not None:
                 self._send(pdo.cob_id, data, t_ns)
 
-    @property
-    def sends_changes(self) -> bool:
-        """Whether a change may send a PDO at present."""
-        return self._cycle_ns is not None
-
     def look(self, t_ns: int) -> None:
         """Something may have changed."""
-        if self._cycle_ns is None:
+        if self.cycle_ns is None:
             return
         for pdo in self._by_event:
             data = pdo.on_change(t_ns)
@@ -198,7 +196,7 @@ class TransmitPdos:
     @property
     def due_ns(self) -> int | None:
         """When `advance` has something to do."""
-        due_ns = self._cycle_ns
+        due_ns = self.cycle_ns
         for pdo in self._by_event:
             own_ns = pdo.due_ns
             if own_ns is not None and (due_ns is None or own_ns < due_ns):
@@ -213,6 +211,6 @@ class TransmitPdos:
                 data = pdo.at_time(t_ns)
                 if data is not None:
                     self._send(pdo.cob_id, data, t_ns)
-        if self._cycle_ns is not None and self._cycle_ns <= t_ns:
-            self._cycle_ns += CYCLE_NS
+        if self.cycle_ns is not None and self.cycle_ns <= t_ns:
+            self.cycle_ns += CYCLE_NS
         self.look(t_ns)

@@ -19,6 +19,7 @@ FOLLOWING_ERROR = 0x8611
 HARDWARE_LIMIT = 0xFF66
 SENSOR_FAULTS = range(0x7300, 0x7400)
 
+_PROFILE_POSITION, _HOMING = Mode.PROFILE_POSITION, Mode.HOMING
 _PRODUCT_CODE = 0x0402
 _SERIAL_NUMBERS = 4_020_000
 
@@ -201,9 +202,10 @@ class ServoDrive:
     def status_at(self, t_ns: int) -> int:
         """The status word, 6041h."""
         bits = self.state | ALWAYS
-        if self.mode is Mode.PROFILE_POSITION:
+        mode = self.mode
+        if mode is _PROFILE_POSITION:
             bits |= self._profile.status_at(t_ns)
-        elif self.mode is Mode.HOMING:
+        elif mode is _HOMING:
             bits |= self.homing.status_at(t_ns)
         return int(bits)
 

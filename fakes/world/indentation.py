@@ -10,14 +10,14 @@ import numpy as np
 
 from microdrivers.core.units import NS_PER_S
 from microdrivers.fakes.world.approach import Approach
-from microdrivers.fakes.world.mechanics import AT_REST, Contact, Memory
+from microdrivers.fakes.world.mechanics import AT_REST, Contact, Memory, Pace
 
 STEP_NS = 500_000
-_STEP_S = STEP_NS / NS_PER_S
 _STEPS_A_SPAN = 128
 _SPAN_NS = _STEPS_A_SPAN * STEP_NS
 _KEPT_SPANS = 96
 """6 s, for whoever asks late."""
+_KEPT_PACES = 1000
 
 
 class Touch(NamedTuple):
@@ -63,6 +63,8 @@ class Indentation:
 
     def __init__(self, contact: Contact, approach: Approach, *, origin_ns: int) -> None:
         self._contact = contact
+        self._pace = contact.pace(STEP_NS / NS_PER_S)
+        self._paces: dict[int, Pace] = {}
         self._approach = approach
         self._origin_ns = origin_ns
         self._first = (0, AT_REST)
@@ -85,8 +87,8 @@ class Indentation:
         depth_um, reachable = span.approach.depth_at(t_ns)
         if _idle(memory) and not (reachable and depth_um > memory.slip_um):
             return Touch(memory.slip_um, 0.0, memory.slip_um, depth_um, 0.0, False)
-        duration_s = (t_ns - begin_ns - steps * STEP_NS) / NS_PER_S
-        memory, force_uN = self._contact.step(memory, duration_s, depth_um, reachable)
+        pace = self._pace_of(t_ns - begin_ns - steps * STEP_NS)
+        memory, force_uN = self._contact.step(memory, pace, depth_um, reachable)
         deformation_um = memory.compression_um + memory.slip_um
         return Touch(
             deformation_um,
@@ -96,6 +98,15 @@ class Indentation:
             force_uN,
             memory.touched,
         )
+
+    def _pace_of(self, duration_ns: int) -> Pace:
+        """Whoever asks at a fixed rate asks for few different ones."""
+        pace = self._paces.get(duration_ns)
+        if pace is None:
+            if len(self._paces) > _KEPT_PACES:
+                self._paces.clear()
+            pace = self._paces[duration_ns] = self._contact.pace(duration_ns / NS_PER_S)
+        return pace
 
     # ------------------------------------------------------------------ spans
 
@@ -117,7 +128,7 @@ class Indentation:
             number, memory = until, self._spans[-1].memories[-1]
         begin_ns = self._origin_ns + number * _SPAN_NS
         approach = self._approach.from_instant(begin_ns)
-        if approach.still and self._contact.step(memory, _STEP_S, *approach.depth_at(begin_ns))[0] == memory:
+        if approach.still and self._contact.step(memory, self._pace, *approach.depth_at(begin_ns))[0] == memory:
             return _Span(number, None, approach, [memory])
         depths, reachable = approach.depths_at(begin_ns + STEP_NS * np.arange(1, _STEPS_A_SPAN + 1))
         untouched = 0
@@ -127,9 +138,9 @@ class Indentation:
                 return _Span(number, number + 1, approach, [memory])
             untouched = int(meets.argmax())
         memories = [memory] * (untouched + 1)
-        step = self._contact.step
+        step, pace = self._contact.step, self._pace
         for depth_um, met in zip(depths[untouched:].tolist(), reachable[untouched:].tolist(), strict=True):
-            memory, _ = step(memory, _STEP_S, depth_um, met)
+            memory, _ = step(memory, pace, depth_um, met)
             memories.append(memory)
         return _Span(number, number + 1, approach, memories)
 

@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 _NEWTON_STEPS = 60
-_CONVERGED_UM = 1e-11
+_CONVERGED_UM = 1e-12
 _NEGLIGIBLE = 1e-3
 """µm, µN and µm/s: what is left of a relaxation that counts as over."""
 
@@ -66,6 +66,18 @@ AT_REST = Memory(0.0, 0.0, 0.0, 0.0, False)
 """Of a specimen that has never been touched."""
 
 
+class Pace(NamedTuple):
+    """What a step of a certain length has in common with all others of that length; made by `Contact.pace`."""
+
+    duration_s: float
+    kept: float
+    coupling: float
+    inertia: float
+    slip_share: float
+    b_loading: float
+    b_unloading: float
+
+
 class Contact:
     """Steps the memory of one specimen that is pressed by a tip on a spring, the sensor's own.
 
@@ -77,71 +89,78 @@ class Contact:
 
     def __init__(self, mechanics: Mechanics, *, stiffness_uN_per_um: float) -> None:
         self.mechanics = mechanics
-        self._stiffness = stiffness_uN_per_um
+        self._k1 = mechanics.k1_uN_per_um
+        self._k2 = mechanics.k2_uN_per_um3
+        self._slip_um = mechanics.slip_um
+        self._adhesion_uN = mechanics.adhesion_uN
+        self._spring = stiffness_uN_per_um
         self._rigid = math.isinf(stiffness_uN_per_um)
 
-    def step(self, memory: Memory, duration_s: float, depth_um: float, reachable: bool) -> tuple[Memory, float]:
-        """What it remembers `duration_s` (> 0) later, and the force on the tip then, µN.
+    def pace(self, duration_s: float) -> Pace:
+        """For steps of `duration_s` (> 0)."""
+        own = self.mechanics
+        kept = math.exp(-duration_s / own.branch_s)
+        return Pace(
+            duration_s=duration_s,
+            kept=kept,
+            coupling=own.branch_uN_per_um * (1.0 - kept) * own.branch_s / duration_s,
+            inertia=own.m_kg / (duration_s * duration_s),
+            slip_share=-math.expm1(-own.slip_rate_per_s * duration_s),
+            b_loading=own.b_loading_uN_s_per_um / duration_s,
+            b_unloading=own.b_unloading_uN_s_per_um / duration_s,
+        )
+
+    def step(self, memory: Memory, pace: Pace, depth_um: float, reachable: bool) -> tuple[Memory, float]:
+        """What it remembers a step later, and the force on the tip then, µN.
 
         Args:
             memory: at the step's beginning.
-            duration_s: of the step.
+            pace: of the step.
             depth_um: at its end, how far beyond the undeformed surface the tip would be if its spring did not give in.
             reachable: whether the tip is where the specimen is at all.
         """
-        own = self.mechanics
         before_um, rate_um_s, slip_um, branch_uN, touched = memory
-        if touched and own.slip_um:
-            slip_um -= (own.slip_um - slip_um) * math.expm1(-own.slip_rate_per_s * duration_s)
+        duration_s, kept, coupling, inertia, slip_share, b_loading, b_unloading = pace
+        if touched:
+            slip_um += (self._slip_um - slip_um) * slip_share
         # The force is b·c′ + stiff·c + k2·c³ − known, where c is the compression at the step's end.
-        stiff, known, kept, coupling = own.k1_uN_per_um, 0.0, 0.0, 0.0
-        if own.branch_uN_per_um:
-            kept = math.exp(-duration_s / own.branch_s)
-            coupling = own.branch_uN_per_um * (1.0 - kept) * own.branch_s / duration_s
-            stiff += coupling
-            known += coupling * before_um - kept * branch_uN
-        if own.m_kg:
-            inertia = own.m_kg / (duration_s * duration_s)
-            stiff += inertia
-            known += inertia * (before_um + rate_um_s * duration_s)
-        touches = False
+        stiff = self._k1 + coupling + inertia
+        known = coupling * before_um - kept * branch_uN + inertia * (before_um + rate_um_s * duration_s)
+        touches, after_um, force_uN = False, before_um, 0.0
         if reachable:
-            after_um, force_uN = self._pressed(stiff, known, before_um, depth_um - slip_um, duration_s)
-            touches = force_uN > (-own.adhesion_uN if touched else 0.0)
+            depth_um -= slip_um
+            if self._rigid:
+                after_um = depth_um
+                damper = b_loading if after_um > before_um else b_unloading
+                force_uN = damper * (after_um - before_um) + (stiff + self._k2 * after_um * after_um) * after_um - known
+            else:
+                spring = self._spring
+                pushed = known + spring * depth_um
+                after_um = _solve(self._k2, stiff + spring, pushed, before_um, b_loading, b_unloading)
+                force_uN = spring * (depth_um - after_um)
+            touches = force_uN > (-self._adhesion_uN if touched else 0.0)
         if not touches:
-            after_um, force_uN = self._solve(stiff, known, before_um, duration_s), 0.0
+            after_um, force_uN = _solve(self._k2, stiff, known, before_um, b_loading, b_unloading), 0.0
         branch_uN = kept * branch_uN + coupling * (after_um - before_um)
         rate_um_s = (after_um - before_um) / duration_s
         if not touches and abs(after_um) + abs(branch_uN) + abs(rate_um_s) < _NEGLIGIBLE:
             return AT_REST._replace(slip_um=slip_um), 0.0
         return Memory(after_um, rate_um_s, slip_um, branch_uN, touches), force_uN
 
-    def _pressed(
-        self, stiff: float, known: float, before_um: float, depth_um: float, duration_s: float
-    ) -> tuple[float, float]:
-        """Compression and force if the tip is at the membrane; `depth_um` is the stage's, less the slip."""
-        if not self._rigid:
-            spring = self._stiffness
-            after_um = self._solve(stiff + spring, known + spring * depth_um, before_um, duration_s)
-            return after_um, spring * (depth_um - after_um)
-        own, growth_um = self.mechanics, depth_um - before_um
-        damper = own.b_loading_uN_s_per_um if growth_um > 0.0 else own.b_unloading_uN_s_per_um
-        cubic = own.k2_uN_per_um3 * depth_um * depth_um
-        return depth_um, damper * growth_um / duration_s + (stiff + cubic) * depth_um - known
 
-    def _solve(self, stiff: float, known: float, before_um: float, duration_s: float) -> float:
-        """The root of b·c′ + stiff·c + k2·c³ = known, whose left-hand side rises with c: there is one."""
-        own = self.mechanics
-        k2 = own.k2_uN_per_um3
-        grows = (stiff + k2 * before_um * before_um) * before_um < known
-        damper = (own.b_loading_uN_s_per_um if grows else own.b_unloading_uN_s_per_um) / duration_s
-        stiff += damper
-        known += damper * before_um
-        after_um = before_um
-        for _ in range(_NEWTON_STEPS):
-            bend = k2 * after_um * after_um
-            correction = ((stiff + bend) * after_um - known) / (stiff + 3.0 * bend)
-            after_um -= correction
-            if abs(correction) < _CONVERGED_UM:
-                break
-        return after_um
+def _solve(k2: float, stiff: float, known: float, before_um: float, b_loading: float, b_unloading: float) -> float:
+    """The c with b·(c − before) + stiff·c + k2·c³ = known, by Newton's method; the left-hand side rises with c."""
+    grows = (stiff + k2 * before_um * before_um) * before_um < known
+    damper = b_loading if grows else b_unloading
+    stiff += damper
+    known += damper * before_um
+    after_um = before_um
+    for _ in range(_NEWTON_STEPS):
+        bend = k2 * after_um * after_um
+        slope = stiff + 3.0 * bend
+        correction = (known - (stiff + bend) * after_um) / slope
+        after_um += correction
+        # What is still missing is the square of the correction times half the curvature.
+        if 3.0 * k2 * (abs(after_um) + abs(correction)) * correction * correction < _CONVERGED_UM * slope:
+            break
+    return after_um

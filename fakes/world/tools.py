@@ -65,10 +65,10 @@ class Tools:
         """True force along a sensor's axis, positive if its tip is pushed that way."""
         section = self._sensors.get(sensor, {})
         stage = section.get("carried_by")
-        if stage not in self.axes:
+        share = float(section.get("axis", _DEFAULT_DIRECTION)[2])
+        if stage not in self.axes or share == 0.0:
             return 0.0
         depth_um = -self.axes[stage]["z"].position_at(t_ns) - self._world.obstacle_um
         own = float(section.get("stiffness_uN_per_um") or math.inf)
         series = 1.0 / (1.0 / self._world.obstacle_stiffness_uN_per_um + 1.0 / own)
-        share = float(section.get("axis", _DEFAULT_DIRECTION)[2])
         return share * series * max(0.0, depth_um)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
-from microdrivers.cli.output import describe_rig, prepare_folder
+from microdrivers.cli.output import RECORDING, describe_recorded, describe_rig, prepare_folder, start_recording
 from microdrivers.cli.progress import TerminalProgress
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
 
 if TYPE_CHECKING:
+    from microdrivers.core.inbox import Inbox
     from microdrivers.routines.optics.source import OpticsSource
 
 
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option("--images", type=click.Path(path_type=Path), help="Folder with frames.csv: a recorded image sequence.")
+@click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimator on what it recorded.")
+@click.option("--record/--no-record", default=True, show_default=True, help="Record all samples in run.mcap.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-optics/.")
 @click.option("--radius-um", type=float, help="Radius of the circle; default: up to 300, as large as fits the view.")
 @click.option("--zoom-to", type=float, default=1.2, show_default=True, help="Zoom after the change.")
@@ -39,6 +44,8 @@ def optics(
     seed: int,
     world: Path | None,
     images: Path | None,
+    replay: Path | None,
+    record: bool,
     out: Path | None,
     radius_um: float | None,
     zoom_to: float,
@@ -62,16 +69,22 @@ def optics(
       microdrivers calibrate optics --rig lab.yaml           hardware
       microdrivers calibrate optics --rig lab.yaml --fake    the same rig, emulated
       microdrivers calibrate optics --images recording/      a recorded sequence
+      microdrivers calibrate optics --replay runs/7/run.mcap what a run has recorded, again
     """
     from microdrivers.configs import shipped_rig
     from microdrivers.core.errors import ConfigError
 
-    if images is not None and (rig_file is not None or fake or real_time or wire_log is not None):
-        raise ConfigError("--images replaces the rig", remedy="leave out --rig, --fake, --real-time and --wire-log")
+    if images is not None and replay is not None:
+        raise ConfigError("--images and --replay exclude each other", remedy="leave out one of them")
+    if (images or replay) is not None and (rig_file is not None or fake or real_time or wire_log is not None):
+        option = "--images" if images is not None else "--replay"
+        raise ConfigError(f"{option} replaces the rig", remedy="leave out --rig, --fake, --real-time and --wire-log")
     progress = TerminalProgress(quiet=as_json)
     try:
         if images is not None:
             complete = _from_images(images, out, as_json, progress)
+        elif replay is not None:
+            complete = _from_recording(replay, out, as_json, progress)
         else:
             circle = {
                 "radius_um": radius_um,
@@ -81,7 +94,7 @@ def optics(
                 "settled": settled,
             }
             choice = RigChoice(rig_file or shipped_rig(), fake or rig_file is None, seed, world, wire_log)
-            complete = _on_rig(choice, out, circle, real_time, as_json, progress)
+            complete = _on_rig(choice, out, circle, real_time, as_json, progress, record=record)
     finally:
         progress.close()
     if not complete:
@@ -98,6 +111,16 @@ def _from_images(folder: Path, out: Path | None, as_json: bool, progress: Termin
     return _run(SequencePlayback(sequence), provenance, out, as_json, progress)
 
 
+def _from_recording(file: Path, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+    from microdrivers.recording.reader import Recording
+    from microdrivers.routines.optics import OpticsReplay
+
+    with Recording(file) as recording:
+        for loss in recording.losses:
+            progress.step(f"not readable: {loss}")
+        return _run(OpticsReplay(recording), describe_recorded(recording), out, as_json, progress)
+
+
 def _on_rig(
     choice: RigChoice,
     out: Path | None,
@@ -105,6 +128,8 @@ def _on_rig(
     real_time: bool,
     as_json: bool,
     progress: TerminalProgress,
+    *,
+    record: bool,
 ) -> bool:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
@@ -117,11 +142,17 @@ def _on_rig(
     ) as rig:
         settings = CircleSettings(**circle)
         provenance = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict())
-        return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress)
+        return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress, record=record)
 
 
 def _run(
-    source: OpticsSource, known: dict[str, Any], out: Path | None, as_json: bool, progress: TerminalProgress
+    source: OpticsSource,
+    known: dict[str, Any],
+    out: Path | None,
+    as_json: bool,
+    progress: TerminalProgress,
+    *,
+    record: bool = False,
 ) -> bool:
     from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import CalibrationError
@@ -134,7 +165,12 @@ def _run(
 
     folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics")
     truth = OpticsTruthCollector(source.bus)
-    run = calibrate_optics(source, progress=progress)
+    with contextlib.ExitStack() as stack:
+        follow: Callable[[str, Inbox], object] = lambda _name, _inbox: None  # noqa: E731
+        if record:
+            recorder = stack.enter_context(start_recording(folder, bus=source.bus, clock=source.clock, known=known))
+            follow = lambda name, inbox: recorder.follow_arrivals(name, inbox.arrivals)  # noqa: E731
+        run = calibrate_optics(source, progress=progress, on_host=follow)
     if not run.estimates and not run.complete:
         click.echo("nothing had been measured yet", err=True)
         return False
@@ -158,5 +194,6 @@ def _run(
         click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
     else:
         click.echo(optics_summary(result))
-        click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html")
+        recorded = f", {RECORDING}" if record else ""
+        click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html{recorded}")
     return run.complete

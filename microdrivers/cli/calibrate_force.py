@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
-from microdrivers.cli.output import describe_rig, prepare_folder
+from microdrivers.cli.output import RECORDING, describe_recorded, describe_rig, prepare_folder, start_recording
 from microdrivers.cli.progress import TerminalProgress
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
 
 if TYPE_CHECKING:
+    from microdrivers.core.inbox import Inbox
     from microdrivers.routines.force import Characterisation, IndentationSource
 
 _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else in its way?"
@@ -27,6 +30,8 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option("--specimen", metavar="NAME", help="Preset of an emulated specimen; on hardware, a name for the result.")
 @click.option("--csv", "table", type=click.Path(path_type=Path), help="A recorded indentation instead of a rig.")
+@click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimators on what it recorded.")
+@click.option("--record/--no-record", default=True, show_default=True, help="Record all samples in run.mcap.")
 @click.option("--calibration", type=click.Path(path_type=Path), help="result.json of `calibrate optics` for µm.")
 @click.option("--depth-um", type=float, default=110.0, show_default=True, help="How far to press.")
 @click.option("--max-force-uN", "max_force_uN", type=float, help="Where to turn back; default: 80 % of the limit.")
@@ -45,6 +50,8 @@ def force(
     world: Path | None,
     specimen: str | None,
     table: Path | None,
+    replay: Path | None,
+    record: bool,
     calibration: Path | None,
     yes: bool,
     check: bool,
@@ -68,14 +75,18 @@ def force(
       microdrivers calibrate force --rig lab.yaml --depth-um 60   hardware; asks before it moves
       microdrivers calibrate force --rig lab.yaml --fake          the same rig, emulated
       microdrivers calibrate force --csv indentation.csv          time_s, indentation_um, force_uN
+      microdrivers calibrate force --replay runs/7/run.mcap       what a run has recorded, again
     """
     from microdrivers.configs import shipped_rig
 
     progress = TerminalProgress(quiet=as_json)
     try:
+        if table is not None or replay is not None:
+            _refuse_rig_options(table, replay, rig_file, fake or real_time, wire_log or calibration)
         if table is not None:
-            _refuse_rig_options(rig_file, fake, real_time, wire_log, calibration)
             complete = _from_table(table, specimen, out, as_json, progress)
+        elif replay is not None:
+            complete = _from_recording(replay, check, out, as_json, progress)
         else:
             emulated = fake or rig_file is None
             if not emulated and not yes:
@@ -83,7 +94,7 @@ def force(
             overrides = {"specimen": {"preset": specimen}} if emulated and specimen is not None else None
             choice = RigChoice(rig_file or shipped_rig(), emulated, seed, world, wire_log)
             complete = _on_rig(
-                choice, specimen, overrides, calibration, press, check, out, real_time, as_json, progress
+                choice, specimen, overrides, calibration, press, check, out, real_time, as_json, progress, record=record
             )
     finally:
         progress.close()
@@ -93,14 +104,27 @@ def force(
 
 
 def _refuse_rig_options(
-    rig_file: Path | None, fake: bool, real_time: bool, wire_log: Path | None, calibration: Path | None
+    table: Path | None, replay: Path | None, rig_file: Path | None, emulated: bool, other: Path | None
 ) -> None:
     from microdrivers.core.errors import ConfigError
 
-    if rig_file is not None or fake or real_time or wire_log is not None or calibration is not None:
+    if table is not None and replay is not None:
+        raise ConfigError("--csv and --replay exclude each other", remedy="leave out one of them")
+    if rig_file is not None or emulated or other is not None:
+        option = "--csv" if table is not None else "--replay"
         raise ConfigError(
-            "--csv replaces the rig", remedy="leave out --rig, --fake, --real-time, --wire-log and --calibration"
+            f"{option} replaces the rig", remedy="leave out --rig, --fake, --real-time, --wire-log and --calibration"
         )
+
+
+def _from_recording(file: Path, check: bool, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+    from microdrivers.recording.reader import Recording
+    from microdrivers.routines.force import IndentationReplay
+
+    with Recording(file) as recording:
+        for loss in recording.losses:
+            progress.step(f"not readable: {loss}")
+        return _run(IndentationReplay(recording), describe_recorded(recording), check, out, as_json, progress)
 
 
 def _from_table(file: Path, specimen: str | None, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
@@ -122,6 +146,8 @@ def _on_rig(
     real_time: bool,
     as_json: bool,
     progress: TerminalProgress,
+    *,
+    record: bool,
 ) -> bool:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
@@ -136,7 +162,7 @@ def _on_rig(
         settings = PressSettings(**press)
         sight = Sight.calibrated(rig, calibration) if calibration is not None else Sight()
         known = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict() | {"specimen": specimen})
-        return _run(PressExperiment(rig, settings, sight=sight), known, check, out, as_json, progress)
+        return _run(PressExperiment(rig, settings, sight=sight), known, check, out, as_json, progress, record=record)
 
 
 def _run(
@@ -146,6 +172,8 @@ def _run(
     out: Path | None,
     as_json: bool,
     progress: TerminalProgress,
+    *,
+    record: bool = False,
 ) -> bool:
     from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import MicrodriversError
@@ -157,12 +185,17 @@ def _run(
 
     folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force")
     truth = ContactTruthCollector(source.bus)
-    characterisation = Characterisation(source)
-    try:
-        run = characterisation.run(progress, check=check)
-    except MicrodriversError:
-        _keep(characterisation, folder)
-        raise
+    with contextlib.ExitStack() as stack:
+        follow: Callable[[str, Inbox], object] = lambda _name, _inbox: None  # noqa: E731
+        if record:
+            recorder = stack.enter_context(start_recording(folder, bus=source.bus, clock=source.clock, known=known))
+            follow = lambda name, inbox: recorder.follow_arrivals(name, inbox.arrivals)  # noqa: E731
+        characterisation = Characterisation(source, on_host=follow)
+        try:
+            run = characterisation.run(progress, check=check)
+        except MicrodriversError:
+            _keep(characterisation, folder)
+            raise
     command = shlex.join(["microdrivers", *sys.argv[1:]])
     result = build_result(run, describe_run(known, command=command, now=utc_now()))
     result = result.model_copy(update={"truth": truth.compare(result, run.first.deformations)})
@@ -177,7 +210,8 @@ def _run(
         click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
     else:
         click.echo(force_summary(result))
-        click.echo(f"\nwritten to {folder}/: result.json, specimen.yaml, record.csv, report.html")
+        recorded = f", {RECORDING}" if record else ""
+        click.echo(f"\nwritten to {folder}/: result.json, specimen.yaml, record.csv, report.html{recorded}")
     return run.complete
 
 

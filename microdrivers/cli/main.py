@@ -54,6 +54,7 @@ def main(debug: bool) -> None:
       microdrivers doctor lab.yaml                       what is wrong with the rig, and what to try
       microdrivers reference lab.yaml --axes x,y         find the reference of a stage (moves!)
       microdrivers move lab.yaml sample_stage --x-um 7600
+      microdrivers record lab.yaml --for 60              everything that the devices tell, frames included
     """
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
     # Also where a shell has started us with SIGINT ignored: whoever drives stages must be stoppable.
@@ -113,6 +114,11 @@ def calibrate() -> None:
     """Calibrate a part of the rig and write result, calibration and report."""
 
 
+@main.group()
+def recording() -> None:
+    """Look after recordings."""
+
+
 _add(calibrate, "optics", "microdrivers.cli.calibrate", "optics", "Camera to stage, through a zoom change.")
 _add(calibrate, "force", "microdrivers.cli.calibrate_force", "force", "A specimen's springs and damper.")
 _add(main, "check", "microdrivers.cli.check", "check", "Validate a rig file without touching hardware.")
@@ -124,3 +130,5 @@ _add(main, "stop", "microdrivers.cli.stop", "stop", "Stop everything that moves,
 _add(main, "clear-fault", "microdrivers.cli.clear_fault", "clear_fault", "Clear a device's fault, its cause removed.")
 _add(main, "serve", "microdrivers.cli.serve", "serve", "Put every emulator of a rig on a port for other programs.")
 _add(main, "snap", "microdrivers.cli.snap", "snap", "Take one fresh frame and write it to a file.")
+_add(main, "record", "microdrivers.cli.record", "record", "Record what every device tells, frames included.")
+_add(recording, "repair", "microdrivers.cli.recording", "repair", "Make a torn recording readable by any tool.")

@@ -26,8 +26,10 @@ class RigChoice(NamedTuple):
     wire_log: Path | None = None
     wire_replay: Path | None = None
 
-    def build(self) -> Rig:
+    def build(self, *, real_time: bool = False) -> Rig:
         """The rig with all devices closed: on the system clock, or simulated if it is emulated or replayed.
+
+        With `real_time` emulators are on the system clock too.
 
         Raises:
             ConfigError: the rig file, the world file or the wire log is wrong, or options exclude each other.
@@ -42,7 +44,8 @@ class RigChoice(NamedTuple):
             )
         if not self.fake and (self.seed is not None or self.world is not None):
             raise ConfigError("--seed and --world describe a simulation", remedy="add --fake, or leave them out")
-        clock = SystemClock() if not self.fake and self.wire_replay is None else SimulatedClock()
+        live = not self.fake and self.wire_replay is None
+        clock = SystemClock() if live or real_time else SimulatedClock()
         return build_rig(
             self.file, fake=self.fake, seed=self.seed or 0, clock=clock, world=self.world, wire_log=self.wire_log,
             wire_replay=self.wire_replay,

@@ -105,6 +105,7 @@ class Bus:
     def __init__(self) -> None:
         self._topics: dict[str, Topic[Any]] = {}
         self._guards: tuple[Callable[[Sample], object], ...] = ()
+        self._watchers: tuple[Callable[[Topic[Any]], object], ...] = ()
         self._next_order: Callable[[], int] = itertools.count().__next__
 
     @property
@@ -118,7 +119,13 @@ class Bus:
         Raises:
             BusError: it exists with another type.
         """
-        topic = self._topics.setdefault(name, Topic(self, name, sample_type, history))
+        topic = self._topics.get(name)
+        if topic is None:
+            made: Topic[Any] = Topic(self, name, sample_type, history)
+            topic = self._topics.setdefault(name, made)  # another thread may have been first
+            if topic is made:
+                for watcher in self._watchers:
+                    watcher(topic)
         if topic.sample_type is not sample_type:
             raise BusError(
                 f"topic {name!r} carries {topic.sample_type.__name__}, not {sample_type.__name__}",
@@ -129,3 +136,20 @@ class Bus:
     def guard(self, call: Callable[[Sample], object]) -> None:
         """Run `call` on every sample of every topic before its subscribers; an error in it reaches the publisher."""
         self._guards = (*self._guards, call)
+
+    def watch(self, call: Callable[[Topic[Any]], object]) -> Callable[[], None]:
+        """Call `call` with every topic that there is and, before its first sample, with each one that is made later.
+
+        One that is made meanwhile may come twice.
+
+        Returns:
+            what ends it.
+        """
+        self._watchers = (*self._watchers, call)
+        for topic in tuple(self._topics.values()):
+            call(topic)
+
+        def end() -> None:
+            self._watchers = tuple(watcher for watcher in self._watchers if watcher is not call)
+
+        return end

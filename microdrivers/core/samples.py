@@ -151,6 +151,13 @@ class WireTraffic(Sample, frozen=True, gc=False, kw_only=True):
     data: bytes
 
 
+class RoutineNote(Sample, frozen=True, gc=False, kw_only=True):
+    """What a routine has just settled, as JSON; on topic `routine`. A replay of its recording needs no more."""
+
+    kind: str
+    content: str
+
+
 class DeviceEvent(Sample, frozen=True, gc=False, kw_only=True):
     """Something happened to a device; published on `<name>/event`."""
 

@@ -202,6 +202,8 @@ class ForceGuard:
 
     def _trip(self, reason: str, force_uN: float, *, retract: bool) -> None:
         failures = self._stop(self._stages_to_stop(), reason, _LIMIT_REMEDY)
+        if retract:
+            self._retraction.begin()
         what = f"{reason}; {'stopped, and the tool is taken away' if retract else 'stopped'}"
         self._told(LIMIT_RULE, what, value=force_uN, failures=failures)
 

@@ -15,7 +15,9 @@ _DESCRIPTION = "Run a command where the SocketCAN interfaces vcan0 and vcan1 are
 _DETAILS = """\
 backends:
   native  this kernel: modprobe vcan, ip link add (root or passwordless sudo), if they are not up already
-  uml     User Mode Linux: starts in 2-3 s, Python at full speed, system calls slower; CAN only; needs no root
+  uml     User Mode Linux: starts in 2-3 s, Python at full speed, system calls slower; CAN only; needs no root.
+          Its clock stands still while the host does not let it run, so a busy host makes it late for nothing; with -s
+          it also jumps over times in which all that runs there waits, so they pass at once
   qemu    emulated PC: starts in about 10 s, Python 20-30 times slower; also /dev/video0 (vivid) and two 16550A
           UARTs wired to each other, /dev/ttyS1 and /dev/ttyS2; as root, the guest can read what root can
   auto    the first of native, uml, qemu that can run here (default)
@@ -37,13 +39,14 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vcan-run", description=_DESCRIPTION, epilog=_DETAILS, allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage="vcan-run [-b BACKEND] [-t SECONDS] [-m MIB] [-k MODULES] [--] COMMAND [ARG...]\n"
+        usage="vcan-run [-b BACKEND] [-t SECONDS] [-m MIB] [-k MODULES] [-s] [-v] [--] COMMAND [ARG...]\n"
         "       vcan-run --setup {auto,uml,qemu}",
     )  # fmt: skip
     parser.add_argument("-b", "--backend", choices=("auto", "native", "uml", "qemu"), default="auto")
     parser.add_argument("-t", "--limit", type=_positive, default=900, metavar="SECONDS", help="time limit (900)")
     parser.add_argument("-m", "--memory", type=_positive, default=1024, metavar="MIB", help="of a guest (1024)")
     parser.add_argument("-k", "--modules", action="append", default=[], help="further kernel modules to load")
+    parser.add_argument("-s", "--skip-idle", action="store_true", help="uml: take no real time for waiting")
     parser.add_argument("-v", "--verbose", action="store_true", help="show what the guest's kernel says")
     parser.add_argument(
         "--setup", choices=("auto", "uml", "qemu"),
@@ -73,6 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             memory_mib=options.memory,
             modules=tuple(name for names in options.modules for name in names.split()),
             show_boot_log=options.verbose,
+            skip_idle=options.skip_idle,
         )
         return _run(options.backend, job, cache)
     except NotUsable as error:

@@ -11,13 +11,14 @@ GUEST_FAILED = 125
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A command and the limits and surroundings that it gets."""
+    """A command and the limits and surroundings that it gets; `skip_idle` is for User Mode Linux (`uml_clock.c`)."""
 
     command: tuple[str, ...]
     limit_s: int
     memory_mib: int
     modules: tuple[str, ...]
     show_boot_log: bool
+    skip_idle: bool
 
 
 class NotUsable(Exception):

@@ -80,10 +80,11 @@ class Session:
         # `timeout` ends the machine even if this process is killed, and with it the machine's own children. It puts
         # them in a process group of their own: a Ctrl-C at the terminal reaches this process only.
         limit = ["timeout", "-k", "5", str(self._job.limit_s + _BOOT_LIMIT_S)]
+        settings = ["env", *(f"{name}={value}" for name, value in (environment or {}).items())]  # not for `timeout`
         with self._machine_log.open("wb") as log:
             process = subprocess.Popen(
-                [*limit, *machine], stdin=subprocess.DEVNULL, stdout=log, stderr=log, pass_fds=self.outputs,
-                cwd=self.folder, env={**os.environ, **(environment or {})},
+                [*limit, *settings, *machine], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                pass_fds=self.outputs, cwd=self.folder,
             )  # fmt: skip
         try:
             for descriptor in self.outputs:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import datetime
 import errno
 import sys
 import threading
+from typing import cast
 
 import can
 import pytest
 
+from microdrivers.backends.lines import can_adapter
 from microdrivers.backends.lines.can_adapter import CanAdapter
 from microdrivers.backends.lines.can_line import Received, shared_can_line
 from microdrivers.backends.lines.can_listeners import CanCounters
@@ -289,3 +292,56 @@ def test_kernel_stamps_become_times_of_the_rigs_clock(monkeypatch: pytest.Monkey
         stamp = adapter.stamp(can.Message(arbitration_id=1, timestamp=odd))
         assert stamp.t_ns >= now_ns
         assert stamp.dt_ns == 1_000_000
+
+
+class _TwoClocks:
+    """The rig's clock, and a calendar; each reading takes 0.2 µs, but for the `odd` ones, at which others go first."""
+
+    simulated = False
+
+    def __init__(self, *odd: int) -> None:
+        self.t_ns = 1_000_000_000
+        self.readings = 0
+        self.odd = odd
+
+    def now_ns(self) -> int:
+        self.readings += 1
+        self.t_ns += 3_000_000 if self.readings in self.odd else 200
+        return self.t_ns
+
+    def calendar(self) -> datetime.datetime:
+        self.now_ns()
+        return datetime.datetime.fromtimestamp(0, datetime.UTC) + datetime.timedelta(microseconds=self.t_ns / 1000)
+
+
+def _stamps(monkeypatch: pytest.MonkeyPatch, clock: _TwoClocks, *ends_ns: int) -> list[tuple[int, int]]:
+    adapter = _adapter(monkeypatch, _ScriptedBus(), "socketcan", cast(Clock, clock))
+    monkeypatch.setattr(can_adapter, "utc_now", clock.calendar)
+    return [tuple(adapter.stamp(can.Message(arbitration_id=1, timestamp=end_ns / 1e9))) for end_ns in ends_ns]  # type: ignore[misc]
+
+
+def test_a_kernel_stamp_is_not_spoilt_by_what_comes_between_two_readings(monkeypatch: pytest.MonkeyPatch):
+    """The thread may lose the processor between reading one clock and the other: they are read again."""
+    for odd in range(1, 8):
+        (stamp, _) = _stamps(monkeypatch, _TwoClocks(odd), 999_000_000, 999_500_000)
+        assert stamp[0] == pytest.approx(999_000_000, abs=stamp[1])
+        assert stamp[1] == 50_000
+    (unlucky,) = _stamps(monkeypatch, _TwoClocks(*range(1, 20)), 999_000_000)
+    assert unlucky[0] == pytest.approx(999_000_000, abs=unlucky[1])
+    assert unlucky[1] >= 3_000_000
+
+
+def test_stamps_of_a_line_never_run_backwards(monkeypatch: pytest.MonkeyPatch):
+    """Whatever two clocks say: frames are handed over in the order in which they passed."""
+    stamps = _stamps(monkeypatch, _TwoClocks(), 999_000_000, 999_200_000, 999_150_000, 999_150_000, 999_400_000)
+    times_ns = [t_ns for t_ns, _ in stamps]
+    assert times_ns == sorted(set(times_ns))
+    assert times_ns[2:4] == [times_ns[1] + 1, times_ns[1] + 2]
+    assert stamps[2][1] == pytest.approx(100_000, abs=5_000)  # what was shifted is no better known
+    assert stamps[4] == (pytest.approx(999_400_000, abs=5_000), 50_000)
+
+
+def test_a_message_has_one_stamp(monkeypatch: pytest.MonkeyPatch):
+    adapter = _adapter(monkeypatch, _ScriptedBus(), "slcan", SystemClock())
+    message = can.Message(arbitration_id=1)
+    assert adapter.stamp(message) == adapter.stamp(message)

@@ -24,6 +24,9 @@ from microdrivers.rig.serving import ServedRig
 CHAINED = Path(__file__).parents[1] / "data" / "chained_workstation.yaml"
 """The workstation with three single-axis controllers on one line in place of one for three axes."""
 
+CABLES = {"can1": "can0"}
+"""Controllers on one bus: what is served at the one is seen at the other."""
+
 Given = TypeVar("Given")
 
 
@@ -194,6 +197,9 @@ def served(
             description, transport=transport, seed=seed, world=world, can_interface=can_interface
         ) as serving:
             serving.write(pointing)
+            if can_interface in CABLES:
+                seen, served_on = f": {CABLES[can_interface]}\n", f": {can_interface}\n"
+                pointing.write_text(pointing.read_text(encoding="utf-8").replace(served_on, seen), encoding="utf-8")
             rig = build_rig(pointing)
             for name, driver in (drivers or {}).items():
                 settings = rig.description.devices[name].settings

@@ -96,6 +96,56 @@ def test_arrivals_are_told_without_a_thread(clock: SimulatedClock, medium: Mediu
     assert len(stamps_s) == 1 + 99
 
 
+def test_a_host_in_the_same_process_needs_no_messages(clock: SimulatedClock, medium: Medium, bus: MediumBus) -> None:
+    """All kinds of frames at their time, with SocketCAN's flags; in an exchange, to whoever waits for them."""
+    node = Answering({SDO_REQUEST: SDO_REPLY})
+    medium.attach(node)
+    taken: list[tuple[int, int, bytes, int]] = []
+    bus.deliver_to(lambda *arrival: taken.append((clock.now_ns(), *arrival)), lambda _: None)
+    with can.Bus(interface="microdrivers", channel=CHANNEL) as other:
+        other.send(can.Message(arbitration_id=0x12345, data=b"\x01"))
+        other.send(can.Message(arbitration_id=0x705, is_remote_frame=True, dlc=2, is_extended_id=False))
+        clock.sleep(0.001)
+        medium.inject_error_frame()
+        clock.sleep(0.001)
+    assert [(identifier, data) for _, identifier, data, _ in taken] == [
+        (0x80012345, b"\x01"), (0x40000705, bytes(2)), (0x20000008, bytes(8)),
+    ]  # fmt: skip
+    taken.clear()
+    with clock.transaction():
+        bus.send_data(SDO_REQUEST.id, SDO_REQUEST.data)
+        bus.receive_until(lambda: bool(taken), clock.now_ns() + NS_PER_S)
+    assert node.heard[-1][1] == SDO_REQUEST
+    (now_ns, identifier, data, end_ns) = taken[0]
+    assert (identifier, data) == (SDO_REPLY.id, SDO_REPLY.data)
+    assert end_ns <= now_ns <= end_ns + 50_000
+    begun_ns = clock.now_ns()
+    with clock.transaction():
+        bus.receive_until(lambda: False, begun_ns + NS_PER_MS)
+    assert (clock.now_ns(), len(taken)) == (begun_ns + NS_PER_MS, 1)
+
+
+def test_what_has_arrived_before_is_handed_over_too(clock: SimulatedClock, medium: Medium, bus: MediumBus) -> None:
+    medium.attach(Periodic(0x185))
+    clock.sleep(0.025)
+    taken: list[int] = []
+    bus.deliver_to(lambda identifier, _data, _t_ns: taken.append(identifier), lambda _: None)
+    clock.sleep(0.001)
+    assert taken == [0x705, 0x185, 0x185]
+
+
+def test_a_host_without_messages_is_told_of_a_loss(clock: SimulatedClock, medium: Medium, bus: MediumBus) -> None:
+    lost: list[tuple[int, int | None]] = []
+    bus.deliver_to(lambda *_: None, lambda error: lost.append((clock.now_ns(), error.error_code)))
+    clock.call_at(START_NS + NS_PER_MS, medium.bus_off)
+    clock.sleep(0.1)
+    assert lost == [(START_NS + NS_PER_MS, 100)]
+    with pytest.raises(can.CanOperationError, match="bus-off"):
+        bus.send_data(0x100, b"")
+    with pytest.raises(can.CanOperationError, match="bus-off"), clock.transaction():
+        bus.receive_until(lambda: False, START_NS + NS_PER_S)
+
+
 def test_filters_are_the_ports(clock: SimulatedClock, medium: Medium, bus: MediumBus) -> None:
     medium.attach(Periodic(0x185))
     bus.set_filters([{"can_id": 0x700, "can_mask": 0x780}])

@@ -46,7 +46,7 @@ COMMANDS = [(0, -30.0), (700_123_456, -5.0), (900_000_000, -40.0), (1_600_000_00
 """When and where to the tool goes."""
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=6)
 @given(seed=st.integers(0, 10**6), preset=st.sampled_from(sorted(PRESETS)))
 def test_answers_depend_neither_on_order_nor_on_what_was_asked(seed, preset):
     chance = random.Random(seed)
@@ -112,6 +112,20 @@ def test_a_hold_that_has_settled_costs_nothing(monkeypatch):
     for t_ns in range(end_ns + 20 * NS_PER_S, end_ns + 3600 * NS_PER_S, 60 * NS_PER_S):
         assert bench.indentation.at(t_ns) == held
     assert len(steps) < 200
+
+
+def test_a_command_ends_what_was_at_rest():
+    for first_um, then_um in ((-60.0, -40.0), (-9.0, -60.0)):
+        asked, fresh = Bench(), Bench()
+        asked.push(0, first_um)
+        asked.indentation.at(7 * NS_PER_S)
+        asked.indentation.at(8 * NS_PER_S)
+        fresh.push(0, first_um)
+        for bench in (asked, fresh):
+            bench.push(9 * NS_PER_S, then_um)
+        for after_ns in range(0, NS_PER_S, 13 * NS_PER_MS):
+            t_ns = 9 * NS_PER_S + after_ns
+            assert asked.indentation.at(t_ns) == fresh.indentation.at(t_ns)
 
 
 def test_the_answer_is_continuous_between_the_steps():

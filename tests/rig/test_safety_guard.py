@@ -7,7 +7,7 @@ import pytest
 from microdrivers.backends.cia402 import objects
 from microdrivers.core.errors import ErrorTree, LinkLost, MicrodriversError, MoveCancelled, UnsafeError
 from microdrivers.core.samples import ForceSample
-from microdrivers.devices.force_sensor import SATURATED, UNTARED
+from microdrivers.devices.force_sensor import SATURATED, UNTARED, Tare
 from tests.rig.guarded_rig import (
     LIMIT_UN,
     OTHER,
@@ -81,6 +81,27 @@ def test_the_tool_is_taken_away_and_that_is_seen_to_its_end(guarded, caplog):
     assert "over the limit of 1000 µN; stopped, and the tool is taken away" in caplog.text
 
 
+def test_what_the_stop_itself_adds_does_not_keep_the_tool_from_being_taken_away(guarded):
+    """From 600 µm/s a stage needs 18 µm to stop, which press harder by a third of the limit."""
+    with pytest.raises(MoveCancelled):
+        guarded.stage.move_to(x_um=AT_LIMIT_UM - 100.0, speed_um_s=600.0)
+    guarded.clock.sleep(1.0)
+    assert max(sample.raw_uN for sample in guarded.forces) > 1.2 * LIMIT_UN
+    assert guarded.rules() == ["force limit", "retraction"]
+    assert guarded.true_x_um() > AT_LIMIT_UM + RETRACT_UM - 40.0
+
+
+def test_a_move_does_not_replace_a_retraction_though_the_force_is_gone(guarded):
+    press_too_hard(guarded)
+    guarded.clock.sleep(0.3)
+    assert guarded.stage.retracting
+    assert abs(guarded.forces[-1].raw_uN) < 0.5 * LIMIT_UN
+    with pytest.raises(UnsafeError, match="refused by the force guard"):
+        guarded.stage.start_move_to(x_um=0.0)
+    guarded.clock.sleep(0.7)
+    guarded.stage.move_to(x_um=0.0)
+
+
 def test_only_retractions_pass_until_the_tool_is_away(tmp_path):
     with guarded_rig(tmp_path, with_other=True) as guarded:
         press_too_hard(guarded)
@@ -128,6 +149,18 @@ def test_forces_of_either_sign_count_and_a_saturated_sensor_always_does(guarded)
         guarded.clock.sleep(1.0)
         assert not guarded.rig.safety.tripped
     assert guarded.rules() == ["force limit", "retraction"] * 3
+
+
+def test_a_sensor_at_its_end_tells_no_force_and_trips_also_where_the_limit_is_its_end(tmp_path):
+    safety = {"force_guards": [{"sensor": SENSOR, "stage": STAGE, "max_force_uN": 2000}], "keep_out": "none"}
+    with guarded_rig(tmp_path, safety=safety) as guarded:
+        guarded.stage.move_to(x_um=10.0)
+        guarded.sensor._tare = Tare(t_ns=0, offset_uN=150.0, sigma_uN=0.1, n=10)
+        for force_uN, trips in ((1990.0, False), (2020.0, True)):
+            guarded.press(force_uN)
+            guarded.clock.sleep(0.02)
+            assert bool(guarded.rig.safety.tripped) == trips
+        assert "saturated" in guarded.interventions[0].reason
 
 
 def test_before_the_first_move_nothing_is_retracted(guarded_unmoved):

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import TracebackType
 
+import msgspec
+
 from microdrivers.core.clock.base import Clock, ClockError, ClockEvent, Timer
 from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.units import seconds_to_ns
@@ -202,21 +204,20 @@ class _Transaction:
             clock._dispatch_until(end_ns)
 
 
-class _Call:
+class _Call(msgspec.Struct):
     """One entry of the queue."""
 
-    __slots__ = ("call", "cancelled", "name")
-
-    def __init__(self, call: Callable[[], object], name: str) -> None:
-        self.call = call
-        self.name = name
-        self.cancelled = False
+    call: Callable[[], object]
+    name: str
+    cancelled: bool = False
 
     def cancel(self) -> None:
         self.cancelled = True
 
 
 class _SimulatedEvent:
+    __slots__ = ("_clock", "_set_at_ns")
+
     def __init__(self, clock: SimulatedClock) -> None:
         self._clock = clock
         self._set_at_ns: int | None = None

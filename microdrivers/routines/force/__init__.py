@@ -3,11 +3,12 @@
 from microdrivers.routines.force.characterisation import Characterisation, ForceRun
 from microdrivers.routines.force.playback import IndentationPlayback
 from microdrivers.routines.force.press import PressExperiment, PressSettings
+from microdrivers.routines.force.replay import IndentationReplay
 from microdrivers.routines.force.result import build_result
 from microdrivers.routines.force.sight import Sight
 from microdrivers.routines.force.source import IndentationSource
 
 __all__ = [
-    "Characterisation", "ForceRun", "IndentationPlayback", "IndentationSource", "PressExperiment", "PressSettings",
-    "Sight", "build_result",
+    "Characterisation", "ForceRun", "IndentationPlayback", "IndentationReplay", "IndentationSource",
+    "PressExperiment", "PressSettings", "Sight", "build_result",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from microdrivers.core.contact_samples import (
     VisionForceSample,
 )
 from microdrivers.core.errors import NoContact
-from microdrivers.core.inbox import EstimatorHost
+from microdrivers.core.inbox import EstimatorHost, Inbox
 from microdrivers.core.samples import ForceSample, Frame, Sample
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.force.identify import Identification, identify
@@ -26,7 +26,7 @@ from microdrivers.estimators.force.model import SpecimenModel, slipped_um
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.force.recursion import SpecimenRecursion
 from microdrivers.estimators.force.vision_force import VisionForce
-from microdrivers.routines.force.source import FrameTracker, IndentationSetup, IndentationSource
+from microdrivers.routines.force.source import FrameTracker, IndentationSetup, IndentationSource, host_name
 from microdrivers.routines.progress import Progress, SilentProgress
 
 
@@ -66,14 +66,22 @@ class ForceRun(NamedTuple):
 class Characterisation:
     """Presses, identifies, and presses again with the sensor ignored.
 
-    `first` and `check` hold what was measured even if `run` ends with an error.
+    `first` and `check` hold what was measured even if `run` ends with an error. `on_host` is told the estimators' inbox
+    of each indentation once it is there, for who records the order of arrival.
     """
 
-    def __init__(self, source: IndentationSource, *, keep_samples: bool = False) -> None:
+    def __init__(
+        self,
+        source: IndentationSource,
+        *,
+        keep_samples: bool = False,
+        on_host: Callable[[str, Inbox], object] = lambda _name, _inbox: None,
+    ) -> None:
         self.first: Indentation | None = None
         self.check: Indentation | None = None
         self._source = source
         self._keep_samples = keep_samples
+        self._on_host = on_host
 
     def run(self, progress: Progress | None = None, *, check: bool = True) -> ForceRun:
         """Run it; on any way out the tool is away from the specimen.
@@ -144,6 +152,7 @@ class Characterisation:
                     keep_samples=self._keep_samples,
                 )
             )
+            self._on_host(host_name(1 if model is None else 2), hosts[-1].inbox)
 
         try:
             source.indent(begin, progress)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample
-from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced, OutOfRange, TargetLost
+from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced, OutOfRange
 from microdrivers.core.samples import ForceSample, Frame
 from microdrivers.core.units import Range, check_range
 from microdrivers.devices.camera import Camera
@@ -17,8 +17,10 @@ from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
 from microdrivers.routines.force.sight import Sight
-from microdrivers.routines.force.source import FrameTracker, IndentationNames, IndentationSetup
+from microdrivers.routines.force.source import BEGIN, END, READY, FrameTracker, IndentationNames, IndentationSetup
+from microdrivers.routines.force.watches import Felt, Lost
 from microdrivers.routines.force.way import ProbingWay
+from microdrivers.routines.notes import note
 from microdrivers.routines.progress import Progress
 
 SPEEDS_UM_S = Range(0.1, 100.0)
@@ -30,8 +32,9 @@ _SHARE_OF_LIMIT = 0.8
 _CONTACT_SIGMAS = 8.0
 _LEAST_CONTACT_UN = 1.0
 _CONTACT_READINGS = 3
-_LOST_FRAMES = 15
 _REST_FRAMES = 10
+_WATCH_S, _WATCH_FRAMES, _RECOVERED_UM, _LONGEST_RECOVERY_S = 0.5, 8, 0.1, 120.0
+"""The specimen has recovered when its surface has moved by less than this over so many frames, so far apart."""
 
 
 class PressSettings(NamedTuple):
@@ -86,6 +89,8 @@ class PressExperiment:
         self._way: ProbingWay | None = None
         self._contact_um = math.nan
         self._touched = False
+        self._indented = False
+        self._watcher: FrameTracker | None = None
         self._check_settings()
 
     def _check_settings(self) -> None:
@@ -121,7 +126,8 @@ class PressExperiment:
         self._way = way = ProbingWay(self._stage, self._sensor, self._stage.read().position)
         progress.step("tare: the probe touches nothing")
         self._sensor.tare(self.settings.tare_s)
-        self._travel_in_sight(way, progress)
+        travel = self._travel_in_sight(way, progress)
+        self._sight.learn(*travel[:2], scale_hint_px_per_um=travel.scale_hint_px_per_um)
         progress.step("approach until contact")
         self._contact_um = self._approach(way)
         self._touched = True
@@ -131,8 +137,27 @@ class PressExperiment:
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
         ahead_um = self._contact_um - way.place_um(self._stage.read().position)
         tracker = self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um)
+        # Another one: what is seen between indentations must not change what is seen in them.
+        self._watcher = self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um)
         self._sensor.tare(self.settings.tare_s)
+        self._note_ready(travel, rest, ahead_um)
         return tracker
+
+    def _note_ready(self, travel: _Travel, rest: Sequence[Frame], ahead_um: float) -> None:
+        """What a replay needs to see as this run does."""
+        projection = self._sight.projection
+        known = {
+            "names": self.names._asdict(),
+            "setup": self.setup()._asdict(),
+            "projection": None if projection is None else projection._asdict(),
+            "scale_source": self._sight.source,
+            "travel_frames": [frame.seq for frame in travel.frames],
+            "travel_um": travel.places_um,
+            "scale_hint_px_per_um": travel.scale_hint_px_per_um,
+            "rest_frames": [frame.seq for frame in rest],
+            "contact_ahead_um": ahead_um,
+        }
+        note(self.bus, self.clock, READY, known)
 
     def _require_referenced(self, progress: Progress) -> None:
         unknown = [axis for axis in self._stage.reference_order if not self._stage.referenced[axis]]
@@ -148,7 +173,7 @@ class PressExperiment:
                 f"{self._rig.description.file} {self._stage.name}",
             )
 
-    def _travel_in_sight(self, way: ProbingWay, progress: Progress) -> None:
+    def _travel_in_sight(self, way: ProbingWay, progress: Progress) -> _Travel:
         """Back and forth in free space, with a frame at rest at each step: what moves is the probe."""
         steps, travel_um = self.settings.free_steps, self.settings.free_travel_um
         progress.step(f"the probe's travel in sight, {travel_um:g} µm")
@@ -159,7 +184,7 @@ class PressExperiment:
             places_um.append(way.place_um(self._stage.read().position))
             frames.append(self._camera.grab())
             progress.count(step + 1, steps + 1)
-        self._sight.learn(frames, places_um, scale_hint_px_per_um=self._expected_scale_px_per_um())
+        return _Travel(frames, places_um, self._expected_scale_px_per_um())
 
     def _expected_scale_px_per_um(self) -> float:
         """What objective, adapter, zoom and pixel pitch let expect."""
@@ -171,7 +196,7 @@ class PressExperiment:
         """Go on until the sensor feels the specimen; returns where that was."""
         tare = self._sensor.tared
         threshold_uN = max(_LEAST_CONTACT_UN, _CONTACT_SIGMAS * (tare.sigma_uN if tare is not None else 0.0))
-        felt = _Felt(threshold_uN, _CONTACT_READINGS)
+        felt = Felt(threshold_uN, _CONTACT_READINGS)
         end_um = min(self.settings.most_approach_um, way.longest_um() - self.settings.depth_um)
         if end_um <= 0.0:
             raise OutOfRange(
@@ -204,8 +229,11 @@ class PressExperiment:
         way, asked = self._way, self.settings
         start_um, end_um = self._contact_um - asked.back_off_um, self._contact_um + asked.depth_um
         self._go(way, start_um, asked.free_speed_um_s)
+        if self._indented:
+            self._let_recover(progress)
+        self._indented = True
         progress.step(f"pressing at {asked.speed_um_s:g} µm/s, to {asked.depth_um:g} µm or {self._limit_uN:.0f} µN")
-        felt, lost = _Felt(self._limit_uN, 1), _Lost()
+        felt, lost = Felt(self._limit_uN, 1), Lost()
         total = round(2.0 * (end_um - start_um))
 
         def show(place_um: float, *, back: bool) -> None:
@@ -215,6 +243,7 @@ class PressExperiment:
         with ExitStack() as open_streams:
             open_streams.enter_context(self._readings(felt))
             open_streams.enter_context(self._frames(lost))
+            note(self.bus, self.clock, BEGIN, {})
             begin()
             self.clock.sleep(_AFTER_S)
             self._run(way, end_um, lambda: felt.enough or lost.too_long, lambda um: show(um, back=False))
@@ -224,6 +253,21 @@ class PressExperiment:
             self._run(way, start_um, lambda: lost.too_long, lambda um: show(um, back=True))
             lost.raise_if_too_long(self._camera.name)
             self.clock.sleep(_AFTER_S)
+            note(self.bus, self.clock, END, {})
+
+    def _let_recover(self, progress: Progress) -> None:
+        """Wait until the specimen's surface has come to rest, as the camera sees it."""
+        progress.step("waiting until the specimen has recovered")
+        assert self._watcher is not None
+        seen: list[float] = []
+        for _ in range(round(_LONGEST_RECOVERY_S / _WATCH_S)):
+            sample = self._watcher.update(self._camera.grab())
+            seen.append(sample.deformation_um)
+            before = seen[-1 - _WATCH_FRAMES :][:1]
+            if len(seen) > _WATCH_FRAMES and abs(seen[-1] - before[0]) < _RECOVERED_UM:
+                return
+            self.clock.sleep(_WATCH_S)
+        progress.step(f"the specimen still moves after {_LONGEST_RECOVERY_S:g} s; going on")
 
     def _go(self, way: ProbingWay, place_um: float, speed_um_s: float) -> None:
         self._stage.move_to(**way.targets(place_um), speed_um_s=way.path_speed_um_s(speed_um_s))
@@ -265,7 +309,7 @@ class PressExperiment:
             self.clock.sleep(_LOOK_S)
 
     @contextmanager
-    def _readings(self, felt: _Felt) -> Iterator[None]:
+    def _readings(self, felt: Felt) -> Iterator[None]:
         subscription = self.bus.topic(self._sensor.name, ForceSample).subscribe(felt.take)
         try:
             with self._sensor.stream(self._sensor.stream_rate_hz):
@@ -274,7 +318,7 @@ class PressExperiment:
             subscription.cancel()
 
     @contextmanager
-    def _frames(self, lost: _Lost) -> Iterator[None]:
+    def _frames(self, lost: Lost) -> Iterator[None]:
         subscription = self.bus.topic(self.names.deformation, DeformationSample).subscribe(lost.take)
         try:
             with self._camera.stream(self._camera.settings.rate_hz):
@@ -308,44 +352,9 @@ class PressExperiment:
         return motor.read().zoom if isinstance(motor, ZoomMotor) and motor.link == "open" else None
 
 
-class _Felt:
-    """Whether the force has been beyond a threshold for some readings in a row."""
+class _Travel(NamedTuple):
+    """Frames at rest on a way through free space."""
 
-    def __init__(self, threshold_uN: float, readings: int) -> None:
-        self.force_uN = math.nan
-        self._threshold_uN = threshold_uN
-        self._needed = readings
-        self._beyond = 0
-
-    @property
-    def enough(self) -> bool:
-        return self._beyond >= self._needed
-
-    def take(self, sample: ForceSample) -> None:
-        if self.enough:
-            return
-        beyond = abs(sample.force_uN) > self._threshold_uN  # False for NaN
-        self._beyond = self._beyond + 1 if beyond else 0
-        if beyond:
-            self.force_uN = sample.force_uN
-
-
-class _Lost:
-    """Whether the contact point has been lost for too many frames in a row."""
-
-    def __init__(self) -> None:
-        self._missing = 0
-        self.too_long = False
-
-    def take(self, sample: DeformationSample) -> None:
-        self._missing = 0 if sample.found else self._missing + 1
-        self.too_long = self.too_long or self._missing >= _LOST_FRAMES
-
-    def raise_if_too_long(self, camera: str) -> None:
-        if self.too_long:
-            raise TargetLost(
-                f"the contact point was not seen in {_LOST_FRAMES} frames in a row; the probe was stopped",
-                device=camera,
-                remedy="check focus and light, and that nothing covers the contact point",
-                moved="yes",
-            )
+    frames: list[Frame]
+    places_um: list[float]
+    scale_hint_px_per_um: float

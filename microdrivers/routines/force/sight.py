@@ -69,6 +69,11 @@ class Sight:
         return cls(scale, source=f"optical calibration {file}")
 
     @property
+    def projection(self) -> ImageScale | None:
+        """That of an optical calibration; None if the probe's travel tells the scale."""
+        return self._projection
+
+    @property
     def scale_px_per_um(self) -> float | None:
         """Along the probing direction; None before the probe has travelled in sight."""
         return None if self._tip is None else self._scale(self._tip).px_per_um

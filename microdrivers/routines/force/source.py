@@ -11,6 +11,14 @@ from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.samples import Frame
 from microdrivers.routines.progress import Progress
 
+READY, BEGIN, END = "force/ready", "force/begin", "force/end"
+"""The routine's notes: all is ready for indentations, one begins, it has ended."""
+
+
+def host_name(number: int) -> str:
+    """Under this name the order is recorded in which the estimators got the samples of the n-th indentation."""
+    return f"force/{number}"
+
 
 class IndentationNames(NamedTuple):
     """Topics: the sensor's readings, the deformations, and the frames that these come from (None: they are given)."""

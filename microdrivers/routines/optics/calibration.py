@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from microdrivers.core.inbox import EstimatorHost
+from microdrivers.core.inbox import EstimatorHost, Inbox
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.optics.calibrator import CalibratorSettings, OpticsCalibrator, PointTracker
@@ -23,7 +23,7 @@ from microdrivers.results.optics import (
 )
 from microdrivers.results.record import Provenance, Trace
 from microdrivers.routines.optics.choice import Choice, begins_change, choose_estimate
-from microdrivers.routines.optics.source import Optics, OpticsSource
+from microdrivers.routines.optics.source import HOST, Optics, OpticsSource
 from microdrivers.routines.progress import Progress, SilentProgress
 
 
@@ -53,8 +53,11 @@ def calibrate_optics(
     settings: CalibratorSettings | None = None,
     progress: Progress | None = None,
     keep_samples: bool = False,
+    on_host: Callable[[str, Inbox], object] = lambda _name, _inbox: None,
 ) -> OpticsRun:
     """Let a source publish and estimate P from what it publishes, on line.
+
+    `on_host` is told the estimator's inbox once it is there, for who records the order of arrival.
 
     An interruption (Ctrl-C) ends the source, which stops what moves, and keeps what was measured.
 
@@ -91,6 +94,7 @@ def calibrate_optics(
                 keep_samples=keep_samples,
             )
         )
+        on_host(HOST, hosts[-1].inbox)
 
     complete = True
     try:

@@ -24,6 +24,7 @@ from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.rig import Rig
+from microdrivers.routines.notes import note
 from microdrivers.routines.optics.circle_drive import (
     Circle,
     Instruments,
@@ -32,7 +33,7 @@ from microdrivers.routines.optics.circle_drive import (
     step_along,
     stream_along,
 )
-from microdrivers.routines.optics.source import Optics, SourceNames
+from microdrivers.routines.optics.source import BEGIN, Optics, SourceNames
 from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.progress import Progress
 
@@ -153,14 +154,31 @@ class CircleExperiment:
             centre, radius_um = self._plan(jacobian, corner)
             progress.step(f"circle of {radius_um:.0f} µm about ({centre[0]:.0f}, {centre[1]:.0f}) µm")
             self._stage.move_to(x_um=centre[0] + radius_um, y_um=centre[1])
-            near_px = jacobian @ np.array([radius_um, 0.0])
-            tracker = make_tracker(self._section.target.kind, near_px=(float(near_px[0]), float(near_px[1])))
+            near_px = tuple((jacobian @ np.array([radius_um, 0.0])).tolist())
+            tracker = make_tracker(self._section.target.kind, near_px=near_px)
             frame = self._camera.grab()
             self._require_found(tracker.update(frame))
-            self._drive(Circle(centre, radius_um), frame, lambda: begin(tracker), progress)
+
+            def start() -> None:
+                self._note_beginning(near_px, frame)
+                begin(tracker)
+
+            self._drive(Circle(centre, radius_um), frame, start, progress)
         finally:
             self._stage.stop(by="calibration", reason="the experiment ended")
             self._zoom.stop(by="calibration", reason="the experiment ended")
+
+    def _note_beginning(self, near_px: tuple[float, float], first_frame: Frame) -> None:
+        """What a replay needs to begin as this run does."""
+        known = {
+            "names": self.names._asdict(),
+            "target": self._section.target.kind,
+            "near_px": near_px,
+            "first_frame": first_frame.seq,
+            "frames_expected": self.frames_expected(),
+            "optics": self.optics()._asdict(),
+        }
+        note(self.bus, self.clock, BEGIN, known)
 
     # ------------------------------------------------------------------ before the circle
 

@@ -10,6 +10,12 @@ from microdrivers.core.clock import Clock
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.routines.progress import Progress
 
+BEGIN = "optics/begin"
+"""The routine's note that what follows belongs to the calibration."""
+
+HOST = "optics"
+"""Under this name the order is recorded in which the estimator got its samples."""
+
 
 class SourceNames(NamedTuple):
     """Topics of the three streams."""

@@ -46,12 +46,13 @@ PRESETS = {
 class Push:
     """A trapezoid of the stage, along the probing direction from the undeformed surface: out, in, hold, out again.
 
-    `ripple_um` at `ripple_hz` is added to the stage while it moves in.
+    It comes back at `back_um_s` if that is given; `ripple_um` at `ripple_hz` is added to the stage while it moves in.
     """
 
     start_um: float = -20.0
     depth_um: float = 120.0
     speed_um_s: float = 5.0
+    back_um_s: float | None = None
     acceleration_um_s2: float = 1000.0
     hold_s: float = 0.0
     rest_s: float = 0.5
@@ -75,34 +76,42 @@ class Truth:
     contact_s: float
 
 
-def _ramp(t: Array, push: Push, begin_s: float) -> Array:
+def _ramp(t: Array, push: Push, speed_um_s: float, begin_s: float) -> Array:
     """Distance covered since `begin_s` on a trapezoidal velocity profile that runs the whole way."""
-    way = push.depth_um - push.start_um
-    ramp_s = push.speed_um_s / push.acceleration_um_s2
-    whole_s = way / push.speed_um_s + ramp_s
+    ramp_s = speed_um_s / push.acceleration_um_s2
+    whole_s = _way_s(push, speed_um_s)
     s = np.clip(t - begin_s, 0.0, whole_s)
     up = np.minimum(s, ramp_s)
     down = np.maximum(s - (whole_s - ramp_s), 0.0)
     cruise = np.clip(s - ramp_s, 0.0, whole_s - 2 * ramp_s)
     a = push.acceleration_um_s2
-    return 0.5 * a * up**2 + push.speed_um_s * cruise + push.speed_um_s * down - 0.5 * a * down**2
+    return 0.5 * a * up**2 + speed_um_s * cruise + speed_um_s * down - 0.5 * a * down**2
+
+
+def _way_s(push: Push, speed_um_s: float) -> float:
+    return (push.depth_um - push.start_um) / speed_um_s + speed_um_s / push.acceleration_um_s2
 
 
 def duration_s(push: Push) -> float:
-    one_way = (push.depth_um - push.start_um) / push.speed_um_s + push.speed_um_s / push.acceleration_um_s2
-    return 2.0 * push.rest_s + 2.0 * one_way + push.hold_s
+    return (
+        2.0 * push.rest_s
+        + _way_s(push, push.speed_um_s)
+        + push.hold_s
+        + _way_s(push, push.back_um_s or push.speed_um_s)
+    )
 
 
 def stage_um(t: Array, push: Push) -> Array:
     """Where the tip would be without a force."""
-    one_way = (push.depth_um - push.start_um) / push.speed_um_s + push.speed_um_s / push.acceleration_um_s2
-    back_s = push.rest_s + one_way + push.hold_s
+    in_s = _way_s(push, push.speed_um_s)
     ripple = np.zeros_like(t)
     if push.ripple_um:
-        s = np.clip(t - push.rest_s, 0.0, one_way)
-        turns = max(1.0, np.round(push.ripple_hz * one_way))
-        ripple = push.ripple_um * np.sin(2.0 * np.pi * turns * s / one_way)
-    return push.start_um + _ramp(t, push, push.rest_s) - _ramp(t, push, back_s) + ripple
+        s = np.clip(t - push.rest_s, 0.0, in_s)
+        turns = max(1.0, np.round(push.ripple_hz * in_s))
+        ripple = push.ripple_um * np.sin(2.0 * np.pi * turns * s / in_s)
+    into = _ramp(t, push, push.speed_um_s, push.rest_s)
+    back = _ramp(t, push, push.back_um_s or push.speed_um_s, push.rest_s + in_s + push.hold_s)
+    return push.start_um + into - back + ripple
 
 
 def indent(specimen: Specimen, push: Push, *, steps_a_frame: int = 20) -> Truth:

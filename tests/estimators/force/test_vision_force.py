@@ -170,13 +170,14 @@ def test_damper_changes_at_the_reversal_and_not_around_it() -> None:
 def test_contact_instant_is_that_of_the_deformation_and_carries_the_slip() -> None:
     preset = PRESETS["slip_corrected"]
     errors = []
-    for seed in range(6):
+    for seed in range(12):
         estimator = VisionForce(preset)
-        fed(estimator, frames(indentation(preset, phase=seed / 6), seed=seed)[:300])
+        fed(estimator, frames(indentation(preset, phase=seed / 12), seed=seed)[:150])
         assert estimator.touches
         assert estimator.touched_ns is not None
         errors.append(estimator.touched_ns / 1e9 - CONTACT_S)
     assert np.sqrt(np.mean(np.square(errors))) < 1.0 / RATE_HZ
+    assert abs(np.mean(errors)) < 0.35 / RATE_HZ
 
 
 def test_zero_of_the_model_need_not_be_that_of_the_deformation() -> None:
@@ -255,7 +256,9 @@ def test_beyond_the_characterised_range_is_said() -> None:
     assert len(deeper) == pytest.approx(2 * 40.0 / 5.0 * RATE_HZ, abs=8)
     quick = fed(VisionForce(preset._replace(deepest_um=200.0)), frames(indentation(preset, speed_um_s=9.0)))
     assert sum("OUTSIDE_RANGE" in force.flags for force in quick) > 200
-    same = fed(VisionForce(preset._replace(deepest_um=100.0, fastest_um_s=5.0)), frames(record))
+    same = fed(
+        VisionForce(preset._replace(deepest_um=100.0, fastest_um_s=5.0)), frames(indentation(preset, hold_s=2.0))
+    )
     assert not any(force.flags for force in same)
 
 

@@ -27,3 +27,9 @@ def scene() -> ModuleType:
 def textures() -> ModuleType:
     """The analytic renderer of texture."""
     return _load("texture_scene")
+
+
+@pytest.fixture(scope="session")
+def contact_scenes() -> ModuleType:
+    """The analytic renderer of a probe that presses on a specimen."""
+    return _load("contact_scene")

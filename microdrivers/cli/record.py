@@ -1,0 +1,163 @@
+"""`microdrivers record`."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from microdrivers.cli.rig_options import RigChoice, rig_options
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from microdrivers.core.clock import Clock
+    from microdrivers.devices.base import Device
+    from microdrivers.recording.recorder import Recorder
+    from microdrivers.rig import Rig
+
+_LINE_PERIOD_S = 1.0
+_PLAIN_LINE_PERIOD_S = 10.0
+
+
+@click.command(short_help="Record what every device tells, frames included; nothing moves.")
+@rig_options
+@click.option(
+    "--topics", multiple=True, metavar="NAMES",
+    help="Record these alone, separated by commas; patterns are allowed. Default: all but the bytes on wires.",
+)  # fmt: skip
+@click.option(
+    "--for", "duration_s", type=click.FloatRange(min=0, min_open=True), metavar="S", help="End after S seconds."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FILE", help="New file to write; default: RIG-DATE.mcap."
+)
+@click.option("--real-time", is_flag=True, help="Let a simulation take the time that it simulates.")
+@click.option("--compress-images", is_flag=True, help="Without loss; 40 ms a megapixel.")
+@click.option(
+    "--on-failure", type=click.Choice(["stop", "go-on"]), default="stop", show_default=True,
+    help="What a full disk does: end the recording, or count what is lost and try again.",
+)  # fmt: skip
+def record(
+    choice: RigChoice,
+    topics: tuple[str, ...],
+    duration_s: float | None,
+    out: Path | None,
+    real_time: bool,
+    compress_images: bool,
+    on_failure: str,
+) -> None:
+    """Record all devices of the rig file RIG to an MCAP file, until Ctrl-C or for a given time. Nothing moves.
+
+    Force comes at its sensor's rate, frames at their camera's, poses at 100 Hz, the zoom at 70 Hz. The file is complete after Ctrl-C, and
+    whatever kills the program costs the last 0.1 s at most: see `microdrivers recording repair`.
+
+    \b
+    Examples:
+      microdrivers record lab.yaml
+      microdrivers record lab.yaml --for 60 --out run.mcap
+      microdrivers record lab.yaml --topics 'force,*/event'
+      microdrivers record lab.yaml --fake --for 10
+      microdrivers record lab.yaml --fake --real-time
+    """
+    from microdrivers.core.errors import ConfigError
+    from microdrivers.recording.header import describe_recording
+    from microdrivers.recording.recorder import Recorder
+
+    simulated = (choice.fake or choice.wire_replay is not None) and not real_time
+    if simulated and duration_s is None:
+        raise ConfigError(
+            "a simulation runs as fast as it can, and would fill the disk", remedy="add --for S, or --real-time"
+        )
+    patterns = [name.strip() for names in topics for name in names.split(",") if name.strip()] or None
+    rig = choice.build(real_time=real_time)
+    try:
+        header = describe_recording(
+            source="fake" if rig.fake or rig.file.emulated else "live", seed=(choice.seed or 0) if choice.fake else None,
+            rig=rig.file.name,
+        )  # fmt: skip
+        recorder = Recorder(
+            out or _default_file(rig), bus=rig.bus, clock=rig.clock, header=header, topics=patterns,
+            on_failure="stop" if on_failure == "stop" else "go_on", compress_images=compress_images,
+        )  # fmt: skip
+    except BaseException:
+        rig.close()
+        raise
+    ended_by_user = False
+    try:
+        with recorder, rig, ExitStack() as streams:
+            _attach_rig(recorder, rig)
+            for name, device in rig.devices.items():
+                if recorder.wants(name):
+                    streams.enter_context(device.stream(_rate_hz(device)))
+            _run(rig.clock, recorder, duration_s)
+    except KeyboardInterrupt:
+        ended_by_user = True
+    _tell(recorder, interrupted=ended_by_user)
+
+
+def _default_file(rig: Rig) -> Path:
+    from microdrivers.core.clock import utc_now
+
+    return Path(f"{rig.file.name}-{utc_now():%Y%m%d-%H%M%S}.mcap")
+
+
+def _attach_rig(recorder: Recorder, rig: Rig) -> None:
+    import yaml
+
+    text = yaml.safe_dump(rig.description.as_data(), sort_keys=False, allow_unicode=True)
+    recorder.attach("rig.yaml", text.encode(), "application/yaml")
+
+
+def _rate_hz(device: Device[object]) -> float:
+    from microdrivers.devices.camera import Camera
+    from microdrivers.routines.stream_check import usual_rate_hz
+
+    return device.settings.rate_hz if isinstance(device, Camera) else usual_rate_hz(device)
+
+
+def _run(clock: Clock, recorder: Recorder, duration_s: float | None) -> None:
+    """Wait, and tell how it goes."""
+    live = sys.stderr.isatty()
+    period_s = _LINE_PERIOD_S if live else _PLAIN_LINE_PERIOD_S
+    begin_ns = before_ns = clock.now_ns()
+    before: dict[str, int] = {}
+    end_s = float("inf") if duration_s is None else duration_s
+    try:
+        while (elapsed_s := (clock.now_ns() - begin_ns) / 1e9) < end_s:
+            clock.sleep(min(period_s, end_s - elapsed_s))
+            now_ns = clock.now_ns()
+            messages = {topic: count.messages for topic, count in recorder.counts.items()}
+            line = _line(recorder, messages, before, (now_ns - before_ns) / 1e9, (now_ns - begin_ns) / 1e9)
+            click.echo(f"\r\x1b[2K{line}" if live else line, nl=not live, err=True)
+            before, before_ns = messages, now_ns
+    finally:
+        if live:
+            click.echo("", err=True)
+
+
+def _line(
+    recorder: Recorder, messages: Mapping[str, int], before: Mapping[str, int], period_s: float, elapsed_s: float
+) -> str:
+    rates = " · ".join(
+        f"{topic} {(number - before.get(topic, 0)) / period_s:.0f}/s"
+        for topic, number in messages.items()
+        if number > before.get(topic, 0)
+    )
+    dropped = sum(count.dropped for count in recorder.counts.values())
+    lost = click.style(f"{dropped} dropped", fg="red", bold=True) if dropped else "0 dropped"
+    return f"{elapsed_s:.0f} s | {recorder.size / 1e6:.1f} MB | {lost} | {rates or 'nothing'}"
+
+
+def _tell(recorder: Recorder, *, interrupted: bool) -> None:
+    how = "ended by you; the file is complete" if interrupted else "complete"
+    if recorder.failure is not None:
+        how = f"could not be written all the time: {recorder.failure.strerror or recorder.failure}"
+    click.echo(f"{recorder.file}: {recorder.size / 1e6:.1f} MB, {how}")
+    width = max(map(len, recorder.counts), default=0)
+    for topic, count in recorder.counts.items():
+        if count.messages or count.dropped:
+            click.echo(f"  {topic:<{width}}  {count.messages} samples, {count.dropped} dropped")

@@ -1,0 +1,36 @@
+"""`microdrivers recording repair`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(short_help="Make a torn or damaged recording readable by any MCAP tool.")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE2", help="New file; default: FILE.repaired.mcap.")
+def repair(file: Path, out: Path | None) -> None:
+    """Write all of FILE that is intact to a new file, which any MCAP reader reads. FILE stays as it is.
+
+    For recordings of a program that was killed, of a full disk or a bad copy. Chunks whose CRC does not match are left
+    out; what was kept and what was lost is told.
+
+    \b
+    Examples:
+      microdrivers recording repair run.mcap
+      microdrivers recording repair run.mcap --out whole.mcap
+    """
+    from microdrivers.recording.repair import repair as write_repaired
+
+    report = write_repaired(file, out or file.with_name(f"{file.stem}.repaired.mcap"))
+    click.echo(f"{report.out}: {sum(report.messages.values())} messages kept")
+    width = max(map(len, report.messages), default=0)
+    for topic, number in report.messages.items():
+        click.echo(f"  {topic:<{width}}  {number}")
+    if not report.losses:
+        click.echo("nothing was lost")
+        return
+    click.echo(f"lost {report.lost_bytes} of {report.size} bytes:")
+    for loss in report.losses:
+        click.echo(f"  {loss}")

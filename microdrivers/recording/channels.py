@@ -1,0 +1,22 @@
+"""Which topics a recording has, and the channels that the recorder itself adds."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from fnmatch import fnmatchcase
+
+ARRIVALS_TOPIC = "microdrivers/arrivals"
+DROPS_TOPIC = "microdrivers/drops"
+TRUTH_PREFIX = "truth/"
+
+_WIRE_SUFFIX = "/wire"
+
+
+def is_wanted(topic: str, patterns: Collection[str] | None) -> bool:
+    """Whether a topic is asked for: named, or matched by a pattern such as `truth/*`.
+
+    None asks for all but the bytes on the wires (`*/wire`): drivers make these only while somebody listens.
+    """
+    if patterns is None:
+        return not topic.endswith(_WIRE_SUFFIX)
+    return any(fnmatchcase(topic, pattern) for pattern in patterns)

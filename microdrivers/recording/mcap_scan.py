@@ -1,0 +1,260 @@
+"""Finds what is intact in an MCAP file, however it was torn or damaged.
+
+All that a chunk holds is covered by its CRC. The records around it are not: their lengths are checked against each
+other, and where they contradict, the next chunk that is intact is searched for.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import struct
+import weakref
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
+
+from microdrivers.recording.mcap_writer import CHUNK, MAGIC, RECORD
+
+_INDEX = struct.Struct("<BQHI")
+_FOOTER_SIZE = 29
+_BLOCK_BYTES = 1 << 20
+_LONGEST_CHUNK = 1 << 32
+_CHUNK_PATTERN = re.compile(rb"\x06(?=.{36}(?:\x00{4}|\x04\x00{3}zstd))", re.DOTALL)
+_LOOKAHEAD = CHUNK.size + 12
+_OTHERS = frozenset({
+    Opcode.HEADER, Opcode.FOOTER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END,
+})  # fmt: skip
+_Known = Header | Metadata | Attachment | Footer | Schema | Channel
+
+
+class _Kind(Protocol):
+    @staticmethod
+    def read(stream: ReadDataStream) -> _Known: ...
+
+
+_KINDS: dict[int, _Kind] = {
+    Opcode.HEADER: Header, Opcode.METADATA: Metadata, Opcode.ATTACHMENT: Attachment, Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel,
+}  # fmt: skip
+
+
+class Loss(NamedTuple):
+    """A part of a file that cannot be read.
+
+    Attributes:
+        offset, size: where it is, bytes.
+        what: what is wrong with it.
+    """
+
+    offset: int
+    size: int
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.what} ({self.size} bytes at byte {self.offset})" if self.size else self.what
+
+
+class ChunkPlace(NamedTuple):
+    """Where a chunk is; `holds` tells how many messages of which channel there
+    are in it, as the index behind it says, which nothing vouches for."""
+
+    offset: int
+    length: int
+    holds: dict[int, int]
+    compressed: bool
+
+
+class McapScan:
+    """The intact records of a file; chunks are read and checked one by one as they are asked for.
+
+    Attributes:
+        profile: of the file's header record; None if that is damaged.
+        complete: whether the file has its end.
+        chunks, metadata, attachments: in the order of the file. channels, schemas: those of its summary, by number.
+        losses: what is damaged outside of chunks.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.profile: str | None = None
+        self.complete = False
+        self.chunks: list[ChunkPlace] = []
+        self.metadata: list[Metadata] = []
+        self.attachments: list[Attachment] = []
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.losses: list[Loss] = []
+        self._stream = file.open("rb", buffering=0)
+        self._close = weakref.finalize(self, self._stream.close)
+        self.size = os.fstat(self._stream.fileno()).st_size
+        self.has_magic = self._read(0, len(MAGIC)) == MAGIC
+        if not self.has_magic and self.size:
+            self.losses.append(Loss(0, len(MAGIC), "the file does not begin as an MCAP file does"))
+        self._scan()
+        self._read_summary()
+
+    def close(self) -> None:
+        """No chunk can be read after it."""
+        self._close()
+
+    def read_chunk(self, place: ChunkPlace) -> bytes | Loss:
+        """A chunk's records, or what is wrong with it."""
+        try:
+            head = self._read(place.offset, CHUNK.size)
+            if len(head) < CHUNK.size:
+                return Loss(place.offset, len(head), "the file ends in the middle of a chunk")
+            *_, size, crc, name_size = CHUNK.unpack(head)
+            skipped = CHUNK.size + name_size + 8
+            data = self._read(place.offset + skipped, place.length - skipped)
+        except OSError as error:
+            return Loss(place.offset, place.length, f"a chunk cannot be read: {error.strerror}")
+        if name_size:
+            try:
+                data = zstandard.decompress(data, size)
+            except zstandard.ZstdError:
+                return Loss(place.offset, place.length, "a compressed chunk is damaged")
+        if len(data) != size or zlib.crc32(data) != crc:
+            return Loss(place.offset, place.length, "a chunk is damaged: its CRC does not match")
+        return data
+
+    # ------------------------------------------------------------------ the way through the file
+
+    def _read(self, offset: int, size: int) -> bytes:
+        return os.pread(self._stream.fileno(), size, offset)
+
+    def _scan(self) -> None:
+        offset = len(MAGIC)
+        while offset < self.size:
+            length = self._record_at(offset)
+            if length is None:
+                following = self._next_chunk(offset + 1)
+                ends = following == self.size
+                what = "the file ends in the middle of a record" if ends else "something is damaged here"
+                self.losses.append(Loss(offset, following - offset, what))
+                offset = following
+            elif length == 0:
+                return
+            else:
+                offset += length
+        if self.size:
+            self.losses.append(Loss(self.size, 0, "the recording was not ended: its last 0.1 s may be missing"))
+
+    def _record_at(self, offset: int) -> int | None:
+        """Take up the record there; its whole length, 0 at the end of the data, None if it is damaged."""
+        length = self._plausible(offset)
+        if length is None:
+            return None
+        head = self._read(offset, _LOOKAHEAD)
+        opcode = head[0]
+        if opcode == Opcode.CHUNK:
+            self.chunks.append(ChunkPlace(offset, length, {}, compressed=head[CHUNK.size - 4] > 0))
+        elif opcode == Opcode.MESSAGE_INDEX:
+            _, _, channel, entries_size = _INDEX.unpack_from(head)
+            if self.chunks:
+                self.chunks[-1].holds[channel] = entries_size // 16
+        elif opcode == Opcode.DATA_END:
+            return 0
+        elif not self._other_record(opcode, offset, length):
+            return None if self._plausible(offset + length) is None else length
+        return length
+
+    def _plausible(self, offset: int) -> int | None:
+        """The whole length of the record there if what it says of its size agrees."""
+        head = self._read(offset, _LOOKAHEAD)
+        if len(head) < RECORD.size:
+            return None
+        opcode, length = RECORD.unpack_from(head)
+        agrees = opcode in _OTHERS
+        if opcode == Opcode.CHUNK and len(head) >= CHUNK.size + 8:
+            *_, size, _crc, name_size = CHUNK.unpack_from(head)
+            if name_size in (0, 4) and len(head) >= CHUNK.size + name_size + 8:
+                (stored,) = struct.unpack_from("<Q", head, CHUNK.size + name_size)
+                agrees = length == CHUNK.size - 9 + name_size + 8 + stored
+                agrees = agrees and (stored == size if not name_size else size < _LONGEST_CHUNK)
+        elif opcode == Opcode.MESSAGE_INDEX and len(head) >= _INDEX.size:
+            *_, entries_size = _INDEX.unpack_from(head)
+            agrees = length == 6 + entries_size and entries_size % 16 == 0
+        return RECORD.size + length if agrees and offset + RECORD.size + length <= self.size else None
+
+    def _other_record(self, opcode: int, offset: int, length: int) -> bool:
+        """Take up what lies between chunks; False if it is damaged."""
+        body = self._read(offset, length)
+        record = _parsed(opcode, body[RECORD.size :])
+        if isinstance(record, Header):
+            self.profile = record.profile
+        elif isinstance(record, Metadata):
+            self.metadata.append(record)
+        elif isinstance(record, Attachment) and struct.unpack("<I", body[-4:])[0] == zlib.crc32(body[9:-4]):
+            self.attachments.append(record)
+        else:
+            self.losses.append(Loss(offset, length, f"a record of kind {opcode} is damaged"))
+            return False
+        return True
+
+    def _next_chunk(self, offset: int) -> int:
+        """Where the next intact chunk begins; the file's size if there is none."""
+        while offset < self.size:
+            block = self._read(offset, _BLOCK_BYTES + _LOOKAHEAD)
+            for found in _CHUNK_PATTERN.finditer(block):
+                start = offset + found.start()
+                length = self._plausible(start) if found.start() < _BLOCK_BYTES else None
+                if length is not None and isinstance(self.read_chunk(ChunkPlace(start, length, {}, compressed=False)), bytes):
+                    return start
+            offset += _BLOCK_BYTES
+        return self.size
+
+    def _read_summary(self) -> None:
+        """Channels and schemas as the end of the file repeats them."""
+        tail = self._read(max(0, self.size - _FOOTER_SIZE - len(MAGIC)), _FOOTER_SIZE + len(MAGIC))
+        if tail[:1] != bytes([Opcode.FOOTER]) or tail[_FOOTER_SIZE:] != MAGIC:
+            return
+        self.complete = True
+        footer = _parsed(Opcode.FOOTER, tail[RECORD.size : _FOOTER_SIZE])
+        if not isinstance(footer, Footer) or not 0 < footer.summary_start < self.size:
+            return
+        summary = self._read(footer.summary_start, self.size - _FOOTER_SIZE - len(MAGIC) - footer.summary_start)
+        if zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary)) != footer.summary_crc:
+            self.losses.append(Loss(footer.summary_start, len(summary), "the file's summary is damaged"))
+            return
+        for opcode, start, end in records_in(summary):
+            record = _parsed(opcode, summary[start:end])
+            if isinstance(record, Schema):
+                self.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self.channels[record.id] = record
+
+
+def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of the body of each record of a chunk or a summary that is intact."""
+    position = 0
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        position += RECORD.size
+        yield opcode, position, position + length
+        position += length
+
+
+def read_definition(opcode: int, body: bytes) -> Schema | Channel | None:
+    """The schema or channel with that body; None if it is another record."""
+    record = _parsed(opcode, body)
+    return record if isinstance(record, Schema | Channel) else None
+
+
+def _parsed(opcode: int, body: bytes) -> _Known | None:
+    """The record, if it is of a kind that is needed and can be read."""
+    kind = _KINDS.get(opcode)
+    if kind is None:
+        return None
+    try:
+        return kind.read(ReadDataStream(io.BytesIO(body)))
+    except (McapError, struct.error, UnicodeDecodeError):
+        return None

@@ -1,0 +1,221 @@
+"""Reads recordings, whole, torn or damaged: what is intact is delivered, what is not is told."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from microdrivers.core.errors import ConfigError
+from microdrivers.core.samples import Sample
+from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording
+from microdrivers.recording.header import (
+    CLOCK_RECORD,
+    HEADER_RECORD,
+    PROFILE,
+    SCHEMA_VERSION,
+    ClockMapping,
+    RecordingHeader,
+    from_metadata,
+)
+from microdrivers.recording.mcap_scan import ChunkPlace, Loss, McapScan, read_definition
+from microdrivers.recording.mcap_writer import MESSAGE, RECORD
+from microdrivers.recording.recorded_channels import Action, ChannelReader, FrameJoin, Unreadable, channel_reader
+from microdrivers.recording.survey import Survey, TopicSummary
+
+__all__ = ["Recording", "TopicSummary"]
+
+FoundT = TypeVar("FoundT")
+
+
+class Recording:
+    """A recording that was opened; its samples are read as they are asked for.
+
+    Attributes:
+        header: where it comes from. clock: how its times relate to the calendar's; None if that is damaged.
+        complete: whether it was ended; if not, its writer was killed or the file was cut off.
+
+    Raises:
+        ConfigError: there is no such file, or it may not be read.
+        EmptyRecording: the file is empty or holds no complete record.
+        ForeignRecording: it is not MCAP, or not from microdrivers.
+        FutureRecording: a newer version wrote it.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._scan = open_scan(file)
+        self.complete = self._scan.complete
+        self.header = read_header(self._scan)
+        clocks = [record.metadata for record in self._scan.metadata if record.name == CLOCK_RECORD]
+        read = [clock for data in clocks if (clock := from_metadata(data, ClockMapping)) is not None]
+        self.clock = read[-1] if read else None
+        self._damaged: dict[int, Loss] = {}
+        self._unreadable: dict[tuple[int, int], str] = {}
+
+    def samples(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, Sample]]:
+        """Topic and sample, in recorded order; frames with their images. `topics` may hold patterns: `truth/*`.
+
+        Each call reads the file anew. What cannot be read is left out, and is told by `losses`.
+        """
+        return self._walk(topics, lambda reader: reader.take)
+
+    @cached_property
+    def _survey(self) -> Survey:
+        survey = Survey()
+        for _ in self._walk(None, survey.counter):
+            pass
+        return survey
+
+    @property
+    def topics(self) -> Mapping[str, TopicSummary]:
+        """What there is of each topic; the first look at it reads all of the file."""
+        return self._survey.topics()
+
+    @property
+    def arrivals(self) -> Mapping[str, Sequence[int]]:
+        """Order numbers of the samples in the order in which each estimator's inbox got them, by host.
+
+        Of a recording that was not ended, the last ones may be of samples that it does not hold.
+        """
+        return self._survey.arrivals
+
+    @property
+    def attachments(self) -> Mapping[str, bytes]:
+        """Attached files by name; the last one of a name counts."""
+        return {attachment.name: attachment.data for attachment in self._scan.attachments}
+
+    @property
+    def losses(self) -> list[Loss]:
+        """All that cannot be read, damaged or cut off; the first look at it reads all of the file."""
+        assert self._survey is not None
+        what = Counter(self._unreadable.values())
+        unreadable = [Loss(0, 0, f"{count} × {text}") for text, count in what.items()]
+        return [*sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
+
+    def close(self) -> None:
+        """Close the file; no samples can be read after it."""
+        self._scan.close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------ messages
+
+    def _walk(
+        self, topics: Collection[str] | None, action: Callable[[ChannelReader], Action[FoundT]]
+    ) -> Iterator[tuple[str, FoundT]]:
+        """Topic, and what the channel's action makes of each message of the wanted topics, if it makes anything."""
+        actions: dict[int, tuple[ChannelReader, Action[FoundT]] | None] = {}
+        schemas: dict[int, Schema] = dict(self._scan.schemas)
+        joins: dict[str, FrameJoin] = {}
+
+        def define(channel: Channel) -> None:
+            reader = channel_reader(channel, schemas.get(channel.schema_id), joins)
+            actions[channel.id] = (reader, action(reader)) if _is_wanted(reader.topic, topics) else None
+
+        for channel in self._scan.channels.values():
+            define(channel)
+        for place in self._scan.chunks:
+            if _holds_an_unwanted_image(place, actions):
+                continue
+            chunk = self._scan.read_chunk(place)
+            if isinstance(chunk, Loss):
+                self._damaged[place.offset] = chunk
+                continue
+            position = 0
+            while position < len(chunk):
+                start = position
+                opcode, length = RECORD.unpack_from(chunk, start)
+                position = end = start + RECORD.size + length
+                if opcode != Opcode.MESSAGE:
+                    record = read_definition(opcode, chunk[start + RECORD.size : end])
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel):
+                        define(record)
+                    continue
+                _, _, number, sequence, _, _ = MESSAGE.unpack_from(chunk, start)
+                try:
+                    known = actions[number]
+                except KeyError:
+                    self._unreadable[place.offset, start] = "a message of a channel whose definition is lost"
+                    continue
+                if known is None:
+                    continue
+                reader, act = known
+                start += MESSAGE.size
+                try:
+                    found = act(memoryview(chunk)[start:end] if reader.is_image else chunk[start:end], sequence)
+                except Unreadable as error:
+                    self._unreadable[place.offset, start] = str(error)
+                    continue
+                if found is not None:
+                    yield reader.topic, found
+
+
+def open_scan(file: Path) -> McapScan:
+    """The intact records of a file.
+
+    Raises:
+        ConfigError: there is no such file, or it may not be read.
+    """
+    try:
+        return McapScan(file)
+    except OSError as error:
+        raise ConfigError(
+            f"the recording cannot be read: {error.strerror}", file=str(file), remedy="check the path"
+        ) from error
+
+
+def _is_wanted(topic: str, topics: Collection[str] | None) -> bool:
+    return topics is None or any(fnmatchcase(topic, pattern) for pattern in topics)
+
+
+def _holds_an_unwanted_image(place: ChunkPlace, actions: Mapping[int, object | None]) -> bool:
+    """Whether the chunk holds nothing but an image and its info, and neither is asked for."""
+    numbers = list(place.holds.items())
+    return len(numbers) == 2 and all(count == 1 and actions.get(number, place) is None for number, count in numbers)
+
+
+def read_header(scan: McapScan) -> RecordingHeader:
+    """The recording's header, if the file is one.
+
+    Raises:
+        EmptyRecording, ForeignRecording, FutureRecording: it cannot be read as one.
+    """
+    file = scan.file
+    if scan.size == 0:
+        raise EmptyRecording(f"{file} is empty", remedy="record anew: nothing was written to it")
+    records = [record.metadata for record in scan.metadata if record.name == HEADER_RECORD]
+    headers = [header for data in records if (header := from_metadata(data, RecordingHeader)) is not None]
+    for data in records:
+        number = data.get("schema_version", "")
+        if not headers and number.isdecimal() and int(number) > SCHEMA_VERSION:
+            raise FutureRecording(
+                f"{file} has schema version {number}; this microdrivers reads up to {SCHEMA_VERSION}",
+                remedy=f"install microdrivers {data.get('microdrivers', '')} or newer".replace("  ", " "),
+            )
+    if headers:
+        if headers[0].schema_version > SCHEMA_VERSION:
+            raise FutureRecording(
+                f"{file} has schema version {headers[0].schema_version}; this microdrivers reads up to {SCHEMA_VERSION}",
+                remedy=f"install microdrivers {headers[0].microdrivers} or newer",
+            )
+        return headers[0]
+    if scan.profile == PROFILE and scan.chunks:
+        scan.losses.append(Loss(0, 0, "the recording's header is damaged: who made it is not known"))
+        return RecordingHeader(source="recorded")
+    if scan.profile == PROFILE or (scan.has_magic and scan.profile is None and not scan.chunks):
+        raise EmptyRecording(f"{file} ends before its first complete record", remedy="record anew")
+    what = "an MCAP file, but microdrivers did not write it" if scan.has_magic else "no MCAP file"
+    raise ForeignRecording(f"{file} is {what}", remedy="name a file that `microdrivers record` has written")

@@ -1,0 +1,134 @@
+"""Makes a torn or damaged recording a whole one, which any MCAP reader reads; the original stays as it is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from microdrivers.recording.header import HEADER_RECORD, PROFILE, to_metadata
+from microdrivers.recording.images import IMAGE_SCHEMA
+from microdrivers.recording.mcap_scan import Loss, McapScan, read_definition, records_in
+from microdrivers.recording.mcap_writer import MESSAGE, ChannelKey, LostChunk, McapWriter
+from microdrivers.recording.output import create_file, not_writable
+from microdrivers.recording.reader import open_scan, read_header
+from microdrivers.recording.schemas import FrameInfo, schema_name
+
+
+class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What has become of a recording that was repaired.
+
+    Attributes:
+        file, out: the original and the repaired one.
+        messages: how many messages of which topic were kept.
+        losses: what could not be.
+        size, lost_bytes: of the original, and how many of these cannot be read.
+    """
+
+    file: Path
+    out: Path
+    messages: Mapping[str, int]
+    losses: list[Loss]
+    size: int
+    lost_bytes: int
+
+
+def repair(file: Path, out: Path) -> RepairReport:
+    """Write all of `file` that is intact to the new file `out`.
+
+    Raises:
+        ConfigError: there is no such file, or `out` exists or cannot be written.
+        RecordingError: the file is empty, foreign or from a newer version, as for `Recording`.
+    """
+    scan = open_scan(file)
+    try:
+        header = read_header(scan)
+        output = create_file(out)
+        try:
+            writer = McapWriter(
+                output, profile=PROFILE, library="microdrivers repair",
+                compress_images=any(place.compressed for place in scan.chunks),
+            )  # fmt: skip
+            copy = _Copy(scan, writer)
+            copy.run(to_metadata(header))
+        except (OSError, LostChunk) as error:
+            out.unlink()
+            raise not_writable(out, error.error if isinstance(error, LostChunk) else error) from error
+        finally:
+            output.close()
+    finally:
+        scan.close()
+    losses = sorted([*scan.losses, *copy.losses])
+    return RepairReport(
+        file=file, out=out, messages=dict(copy.messages), losses=losses, size=scan.size,
+        lost_bytes=sum(loss.size for loss in losses),
+    )  # fmt: skip
+
+
+class _Copy:
+    """The way of all intact records from one file to another."""
+
+    def __init__(self, scan: McapScan, writer: McapWriter) -> None:
+        self.messages: Counter[str] = Counter()
+        self.losses: list[Loss] = []
+        self._scan = scan
+        self._writer = writer
+        self._schemas: dict[int, Schema] = dict(scan.schemas)
+        self._channels: dict[int, Channel] = dict(scan.channels)
+        self._undefined = 0
+
+    def run(self, header: Mapping[str, str]) -> None:
+        """Copy everything, and end the file."""
+        self._writer.add_metadata(HEADER_RECORD, header)
+        for record in self._scan.metadata:
+            if record.name != HEADER_RECORD:
+                self._writer.add_metadata(record.name, record.metadata)
+        for attachment in self._scan.attachments:
+            self._writer.add_attachment(
+                attachment.name, attachment.media_type, attachment.data, log_ns=attachment.log_time
+            )
+        for place in self._scan.chunks:
+            chunk = self._scan.read_chunk(place)
+            if isinstance(chunk, Loss):
+                self.losses.append(chunk)
+            else:
+                self._copy_chunk(chunk)
+        self._writer.flush()
+        if self._undefined:
+            self.losses.append(Loss(0, 0, f"{self._undefined} messages of channels whose definition is lost"))
+        self._writer.add_metadata("repair", {"losses": "; ".join(map(str, [*self._scan.losses, *self.losses]))})
+        self._writer.finish()
+
+    def _copy_chunk(self, chunk: bytes) -> None:
+        for opcode, start, end in records_in(chunk):
+            if opcode == Opcode.MESSAGE:
+                self._copy_message(chunk, start, end)
+                continue
+            record = read_definition(opcode, chunk[start:end])
+            if isinstance(record, Schema):
+                self._schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self._channels[record.id] = record
+
+    def _copy_message(self, chunk: bytes, start: int, end: int) -> None:
+        _, _, number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(chunk, start - 9)
+        channel = self._channels.get(number)
+        schema = self._schemas.get(channel.schema_id) if channel is not None else None
+        if channel is None or schema is None:
+            self._undefined += 1
+            return
+        body = start + MESSAGE.size - 9
+        new = self._writer.channel(ChannelKey(channel.topic, schema.name, schema.data))
+        self.messages[channel.topic] += 1
+        if schema.name == schema_name(FrameInfo):
+            self._writer.flush()
+        if schema.name == IMAGE_SCHEMA:
+            self._writer.add_image(new, b"", memoryview(chunk)[body:end], sequence=sequence, log_ns=log_ns, publish_ns=publish_ns)
+        else:
+            self._writer.add_message(
+                new, chunk[body:end], sequence=sequence, log_ns=log_ns, publish_ns=publish_ns
+            )

@@ -1,0 +1,133 @@
+"""Publishes a recording again, in the order in which an estimator's inbox got the samples."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import json
+from collections.abc import Collection, Iterator
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock
+from microdrivers.core.samples import RoutineNote, Sample
+from microdrivers.recording.reader import Recording
+
+ROUTINE = "routine"
+ESTIMATES = ("estimate/*", "*/track", "*/deformation", ROUTINE)
+"""What estimators made of the samples, and a replay makes again."""
+
+_READ_AHEAD = 2000
+"""Samples by which the file's order may differ from the bus's: threads publish side by side."""
+
+
+class Note(NamedTuple):
+    """What a routine settled, and when in the bus's order."""
+
+    kind: str
+    content: Any
+    order: int
+
+
+def notes_of(recording: Recording) -> list[Note]:
+    """All that routines have noted, in their order."""
+    found = [
+        Note(sample.kind, json.loads(sample.content), sample.order)
+        for _, sample in recording.samples((ROUTINE,))
+        if isinstance(sample, RoutineNote)
+    ]
+    return sorted(found, key=lambda note: note.order)
+
+
+class Replay:
+    """Publishes a recording's samples on a bus, once; samples keep their `order`.
+
+    Args:
+        recording: what to publish.
+        bus: where.
+        leave_out: topics, or patterns, that are not published.
+        clock: samples are published at the distances of their times divided by `speed`, on this clock.
+        speed: None publishes as fast as possible.
+
+    Attributes:
+        published: number of samples so far. missing: samples that an inbox got and the recording does not hold.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        bus: Bus,
+        *,
+        leave_out: Collection[str] = ESTIMATES,
+        clock: Clock | None = None,
+        speed: float | None = None,
+    ) -> None:
+        self.published = 0
+        self.missing = 0
+        self._bus = bus
+        self._leave_out = leave_out
+        self._source: Iterator[tuple[str, Sample]] = recording.samples()
+        self._waiting: list[tuple[int, int, str, Sample]] = []
+        self._ties = itertools.count()
+        self._arrivals = recording.arrivals
+        self._clock = clock
+        self._speed = speed
+        self._began_ns: tuple[int, int] | None = None
+
+    def up_to(self, order: int | None) -> None:
+        """Publish all that was published on the bus before `order`; None: all that is left."""
+        while self._fill() and (order is None or self._waiting[0][0] < order):
+            self._publish_next()
+
+    def as_arrived(self, host: str, order: int | None) -> None:
+        """As `up_to`, with the samples of one inbox in the order in which it got them."""
+        if host not in self._arrivals:
+            self.up_to(order)
+            return
+        first = self._waiting[0][0] if self._fill() else 0
+        ordered = [each for each in self._arrivals[host] if each >= first and (order is None or each < order)]
+        members = set(ordered)
+        early: dict[int, tuple[str, Sample]] = {}
+        for wanted in ordered:
+            while wanted not in early and self._fill():
+                if order is not None and self._waiting[0][0] >= order:
+                    break
+                number, _, topic, sample = heapq.heappop(self._waiting)
+                if number in members:
+                    early[number] = (topic, sample)
+                else:
+                    self._publish(topic, sample)
+            if wanted in early:
+                self._publish(*early.pop(wanted))
+            else:
+                self.missing += 1
+        self.up_to(order)
+
+    def _fill(self) -> bool:
+        """Read ahead; tells whether anything is left."""
+        while len(self._waiting) < _READ_AHEAD:
+            entry = next(self._source, None)
+            if entry is None:
+                break
+            topic, sample = entry
+            if not any(fnmatchcase(topic, pattern) for pattern in self._leave_out):
+                heapq.heappush(self._waiting, (sample.order, next(self._ties), topic, sample))
+        return bool(self._waiting)
+
+    def _publish_next(self) -> None:
+        _, _, topic, sample = heapq.heappop(self._waiting)
+        self._publish(topic, sample)
+
+    def _publish(self, topic: str, sample: Sample) -> None:
+        self._keep_pace(sample)
+        self.published += 1
+        self._bus.topic(topic, type(sample)).publish(sample)
+
+    def _keep_pace(self, sample: Sample) -> None:
+        if self._clock is None or self._speed is None:
+            return
+        if self._began_ns is None:
+            self._began_ns = self._clock.now_ns(), sample.t_ns
+        start_ns, first_ns = self._began_ns
+        self._clock.sleep_until(start_ns + round((sample.t_ns - first_ns) / self._speed))

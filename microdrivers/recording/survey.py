@@ -1,0 +1,107 @@
+"""What a recording holds, topic by topic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from microdrivers.core.samples import Sample
+from microdrivers.core.units import NS_PER_S
+from microdrivers.recording.recorded_channels import Action, ChannelReader, NoteReader
+from microdrivers.recording.schemas import Arrivals, Drops
+
+
+class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What there is of one topic.
+
+    Attributes:
+        sample_type: of its samples.
+        count: how many samples can be read.
+        first_t_ns, last_t_ns: earliest and latest instant, ns on the rig's clock; 0 if there are none.
+        rate_hz: mean rate between these; NaN with fewer than two different instants.
+        gaps: how many `seq` numbers are missing between the first and the last sample.
+        unsorted: how many samples describe an instant before their predecessor's.
+        dropped: how many the recorder itself has lost.
+    """
+
+    sample_type: type[Sample]
+    count: int
+    first_t_ns: int
+    last_t_ns: int
+    rate_hz: float
+    gaps: int
+    unsorted: int
+    dropped: int
+
+
+class Survey:
+    """Counts messages as they go by.
+
+    Attributes:
+        arrivals: order numbers of the inbox of each estimator host.
+    """
+
+    def __init__(self) -> None:
+        self.arrivals: dict[str, list[int]] = {}
+        self._dropped: dict[str, int] = {}
+        self._counts: dict[str, _Count] = {}
+
+    def counter(self, reader: ChannelReader) -> Action[None]:
+        """What counts the messages of a channel."""
+        if isinstance(reader, NoteReader):
+            return lambda data, _sequence: self._take_note(reader.note(data))
+
+        def count(data: Any, sequence: int) -> None:
+            stamps = reader.stamps(data, sequence)
+            if stamps is None or reader.sample_type is None:
+                return
+            counted = self._counts.get(reader.topic)
+            if counted is None:
+                counted = self._counts[reader.topic] = _Count(reader.sample_type)
+            counted.add(*stamps)
+
+        return count
+
+    def _take_note(self, note: Arrivals | Drops) -> None:
+        if isinstance(note, Arrivals):
+            self.arrivals.setdefault(note.host, []).extend(note.orders)
+        else:
+            self._dropped[note.topic] = note.dropped
+
+    def topics(self) -> Mapping[str, TopicSummary]:
+        """The summaries so far, in the order of each topic's first sample."""
+        found = {topic: count.summary(self._dropped.get(topic, 0)) for topic, count in self._counts.items()}
+        lost = {topic: number for topic, number in self._dropped.items() if topic not in found}
+        return found | {topic: _Count(Sample).summary(number) for topic, number in lost.items()}
+
+
+class _Count:
+    """The running figures of one topic."""
+
+    __slots__ = ("count", "first_ns", "gaps", "last_ns", "previous_ns", "sample_type", "seq", "unsorted")
+
+    def __init__(self, sample_type: type[Sample]) -> None:
+        self.sample_type = sample_type
+        self.count = self.gaps = self.unsorted = self.seq = 0
+        self.first_ns = self.last_ns = self.previous_ns = 0
+
+    def add(self, t_ns: int, seq: int) -> None:
+        if self.count:
+            self.gaps += max(0, seq - self.seq - 1)
+            self.unsorted += t_ns < self.previous_ns
+            self.first_ns = min(self.first_ns, t_ns)
+            self.last_ns = max(self.last_ns, t_ns)
+        else:
+            self.first_ns = self.last_ns = t_ns
+        self.count += 1
+        self.seq, self.previous_ns = seq, t_ns
+
+    def summary(self, dropped: int) -> TopicSummary:
+        span_ns = self.last_ns - self.first_ns
+        return TopicSummary(
+            sample_type=self.sample_type, count=self.count, first_t_ns=self.first_ns, last_t_ns=self.last_ns,
+            rate_hz=(self.count - 1) * NS_PER_S / span_ns if span_ns else float("nan"), gaps=self.gaps,
+            unsorted=self.unsorted, dropped=dropped,
+        )  # fmt: skip

@@ -1,0 +1,111 @@
+"""A recorded force characterisation as a source of samples: the same estimators, or others, on old data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock, SimulatedClock
+from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.samples import Frame
+from microdrivers.estimators.vision.contact import ImageScale
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.replay import Note, Replay, notes_of
+from microdrivers.routines.force.sight import Sight
+from microdrivers.routines.force.source import (
+    BEGIN,
+    END,
+    READY,
+    FrameTracker,
+    IndentationNames,
+    IndentationSetup,
+    host_name,
+)
+from microdrivers.routines.progress import Progress
+
+
+class IndentationReplay:
+    """Publishes what `calibrate force` has recorded, in the order in which its estimators got it.
+
+    Raises:
+        UnsupportedError: the recording holds no force characterisation.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.bus = Bus()
+        self.clock: Clock = SimulatedClock()
+        self._recording = recording
+        notes = notes_of(recording)
+        ready = [note for note in notes if note.kind == READY]
+        if not ready:
+            raise UnsupportedError(
+                f"{recording.file} holds no force characterisation",
+                remedy="give the run.mcap of `calibrate force`; `microdrivers info` tells what a file holds",
+            )
+        self._ready = ready[-1]
+        self._begins = [note for note in notes if note.kind == BEGIN and note.order > self._ready.order]
+        self._ends = [note for note in notes if note.kind == END and note.order > self._ready.order]
+        self.names = IndentationNames(**self._ready.content["names"])
+        self.repeatable = len(self._begins) > 1
+        self._replay = Replay(recording, self.bus)
+        self._indentations = 0
+
+    def prepare(self, progress: Progress) -> FrameTracker | None:
+        """Publish what came before the first indentation, and learn from its frames what is tracked."""
+        progress.step(f"replaying {self._recording.file}")
+        known = self._ready.content
+        if self.names.camera is None:
+            self._replay.up_to(self._ready.order)
+            return None
+        wanted = {*known["travel_frames"], *known["rest_frames"]}
+        frames: dict[int, Frame] = {}
+
+        def keep(frame: Frame) -> None:
+            if frame.seq in wanted:
+                frames[frame.seq] = frame
+
+        subscription = self.bus.topic(self.names.camera, Frame).subscribe(keep)
+        self._replay.up_to(self._ready.order)
+        subscription.cancel()
+        projection = known["projection"]
+        scale = None if projection is None else ImageScale(tuple(projection["um_per_px"]), projection["relative_sigma"])
+        sight = Sight(scale, source=known["scale_source"])
+        sight.learn(
+            self._all(frames, known["travel_frames"]),
+            known["travel_um"],
+            scale_hint_px_per_um=known["scale_hint_px_per_um"],
+        )
+        rest = self._all(frames, known["rest_frames"])
+        return sight.tracker(self.names.camera, rest, contact_ahead_um=known["contact_ahead_um"])
+
+    def _all(self, frames: dict[int, Frame], numbers: Sequence[int]) -> list[Frame]:
+        missing = [number for number in numbers if number not in frames]
+        if missing:
+            raise UnsupportedError(
+                f"{self._recording.file} lacks {len(missing)} of the frames by which the probe was found",
+                remedy="record the camera's topic from the beginning of the routine",
+            )
+        return [frames[number] for number in numbers]
+
+    def indent(self, begin: Callable[[], None], progress: Progress) -> None:
+        """Publish the next indentation of the recording."""
+        number = self._indentations = self._indentations + 1
+        start = self._begins[number - 1].order if number <= len(self._begins) else None
+        self._replay.up_to(start)
+        begin()
+        self._replay.as_arrived(host_name(number), self._end(number))
+        if self._replay.missing:
+            progress.step(f"{self._replay.missing} samples that the estimators had are not in the recording")
+
+    def _end(self, number: int) -> int | None:
+        """Where the indentation ends in the bus's order: at its note or, if it was broken off, with the recording."""
+        later: list[Note] = [note for note in self._ends if note.order > self._begins[number - 1].order]
+        return later[0].order if later else None
+
+    def finish(self) -> None:
+        """Publish what is left."""
+        self._replay.up_to(None)
+
+    def setup(self) -> IndentationSetup:
+        """As it was."""
+        return IndentationSetup(**self._ready.content["setup"])

@@ -1,0 +1,62 @@
+"""What an indentation must notice while it goes on."""
+
+from __future__ import annotations
+
+import math
+
+from microdrivers.core.contact_samples import DeformationSample
+from microdrivers.core.errors import TargetLost
+from microdrivers.core.samples import ForceSample
+
+LOST_FRAMES = 15
+
+
+class Felt:
+    """Whether the force has been beyond a threshold for some readings in a row."""
+
+    def __init__(self, threshold_uN: float, readings: int) -> None:
+        self.force_uN = math.nan
+        self._threshold_uN = threshold_uN
+        self._needed = readings
+        self._beyond = 0
+
+    @property
+    def enough(self) -> bool:
+        """It has."""
+        return self._beyond >= self._needed
+
+    def take(self, sample: ForceSample) -> None:
+        """Take a reading."""
+        if self.enough:
+            return
+        beyond = abs(sample.force_uN) > self._threshold_uN  # False for NaN
+        self._beyond = self._beyond + 1 if beyond else 0
+        if beyond:
+            self.force_uN = sample.force_uN
+
+
+class Lost:
+    """Whether the contact point has been lost for too many frames in a row."""
+
+    def __init__(self) -> None:
+        self._missing = 0
+        self.too_long = False
+
+    def take(self, sample: DeformationSample) -> None:
+        """Take what was seen in a frame."""
+        self._missing = 0 if sample.found else self._missing + 1
+        self.too_long = self.too_long or self._missing >= LOST_FRAMES
+
+    def raise_if_too_long(self, camera: str) -> None:
+        """End the experiment if it has.
+
+        Raises:
+            TargetLost: it has.
+        """
+        if self.too_long:
+            raise TargetLost(
+                f"the contact point was not seen in {LOST_FRAMES} frames in a row; the probe was stopped",
+                device=camera,
+                remedy="check focus and light, and that nothing covers the contact point",
+                moved="yes",
+            )

@@ -1,0 +1,78 @@
+"""A recorded calibration as a source of samples: the same estimator, or another one, on old data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import Clock, SimulatedClock
+from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.samples import Frame
+from microdrivers.estimators.optics.calibrator import PointTracker
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.replay import Note, Replay, notes_of
+from microdrivers.routines.optics.source import BEGIN, HOST, Optics, SourceNames
+from microdrivers.routines.optics.targets import make_tracker
+from microdrivers.routines.progress import Progress
+
+
+class OpticsReplay:
+    """Publishes what `calibrate optics` has recorded, in the order in which its estimator got it.
+
+    Raises:
+        UnsupportedError: the recording holds no optical calibration.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.bus = Bus()
+        self.clock: Clock = SimulatedClock()
+        self._recording = recording
+        self._beginning = _beginning(recording)
+        self.names = SourceNames(**self._beginning.content["names"])
+        self._frames: list[Frame] = []
+
+    def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
+        """Publish the whole recording."""
+        noted = self._beginning.content
+        progress.step(f"replaying {self._recording.file}")
+        tracker = make_tracker(noted["target"], near_px=tuple(noted["near_px"]))
+        replay = Replay(self._recording, self.bus)
+        subscription = self.bus.topic(self.names.camera, Frame).subscribe(self._keep)
+        replay.up_to(self._beginning.order)
+        subscription.cancel()
+        first = [frame for frame in self._frames if frame.seq == noted["first_frame"]]
+        if not first:
+            raise UnsupportedError(
+                f"{self._recording.file} lacks the frame in which the target was found",
+                remedy="record the camera's topic from the beginning of the routine",
+            )
+        tracker.update(first[-1])
+        self._frames.clear()
+        begin(tracker)
+        replay.as_arrived(HOST, None)
+        if replay.missing:
+            progress.step(f"{replay.missing} samples that the estimator had are not in the recording")
+
+    def _keep(self, frame: Frame) -> None:
+        if frame.seq == self._beginning.content["first_frame"]:
+            self._frames.append(frame)
+
+    def optics(self) -> Optics:
+        """As they were."""
+        noted = self._beginning.content["optics"]
+        return Optics(**noted | {"roi": tuple(noted["roi"])})
+
+    def frames_expected(self) -> int | None:
+        """As it was."""
+        expected: int | None = self._beginning.content["frames_expected"]
+        return expected
+
+
+def _beginning(recording: Recording) -> Note:
+    notes = [note for note in notes_of(recording) if note.kind == BEGIN]
+    if not notes:
+        raise UnsupportedError(
+            f"{recording.file} holds no optical calibration",
+            remedy="give the run.mcap of `microdrivers calibrate optics`; `microdrivers info` tells what a file holds",
+        )
+    return notes[-1]

@@ -1,0 +1,188 @@
+"""Torn, damaged, empty, foreign and future files: what is delivered is what was written, the rest is told."""
+
+import random
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+from microdrivers.core.errors import ConfigError
+from microdrivers.core.samples import ForceSample
+from microdrivers.recording.header import RecordingHeader
+from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording, RecordingError
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.recorder import Recorder
+from microdrivers.recording.repair import repair
+
+SLOW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def damage(data, cut, flips):
+    damaged = bytearray(data if cut is None else data[: cut % (len(data) + 1)])
+    for place, bit in flips:
+        if damaged:
+            damaged[place % len(damaged)] ^= 1 << bit
+    return bytes(damaged)
+
+
+FLIPS = st.lists(st.tuples(st.integers(0, 2**31), st.integers(0, 7)), max_size=3)
+
+
+def check_is_part_of(same, found, published):
+    """Found samples are samples that were published, in their order."""
+    rest = iter(published)
+    for topic, sample in found:
+        assert any(topic == other_topic and same(sample, other) for other_topic, other in rest)
+
+
+def test_no_damage_makes_a_sample_that_was_not_written(recorded, same, tmp_path):
+    whole = recorded.file.read_bytes()
+    file, out = tmp_path / "damaged.mcap", tmp_path / "repaired.mcap"
+
+    @SLOW
+    @given(st.one_of(st.none(), st.integers(0, len(whole))), FLIPS)
+    def check(cut, flips):
+        data = damage(whole, cut, flips)
+        file.write_bytes(data)
+        out.unlink(missing_ok=True)
+        try:
+            recording = Recording(file)
+        except RecordingError:
+            with pytest.raises(RecordingError):
+                repair(file, out)
+            assert not out.exists()
+            return
+        found = list(recording.samples())
+        check_is_part_of(same, found, recorded.published)
+        assert sum(topic.count for topic in recording.topics.values()) == len(found)
+        if len(found) < len(recorded.published):
+            assert recording.losses
+        repair(file, out)
+        check_official(out)
+        again = list(Recording(out).samples())
+        assert len(again) == len(found)
+        check_is_part_of(same, again, recorded.published)
+
+    check()
+
+
+def check_official(file):
+    """The official reader takes the file, its CRCs are right, and log times run forwards in each channel."""
+    with file.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        last = {}
+        count = 0
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            assert message.log_time >= last.get(channel.id, 0)
+            last[channel.id] = message.log_time
+            count += 1
+        statistics = reader.get_summary().statistics
+        assert statistics.message_count == count
+        assert sum(1 for _ in reader.iter_messages()) == count
+        assert [attachment.name for attachment in reader.iter_attachments()] in ([], ["rig.yaml"])
+    with file.open("rb") as stream:
+        messages = [record for record in StreamReader(stream, validate_crcs=True).records if isinstance(record, Message)]
+    assert len(messages) == count
+
+
+def test_a_whole_recording_passes_the_official_reader(recorded):
+    check_official(recorded.file)
+
+
+def test_an_interrupted_recording_is_read_up_to_the_tear(stage, same, tmp_path):
+    with stage.recorder():
+        stage.run(seconds=0.56)
+        torn = stage.file.read_bytes()
+    stage.file.write_bytes(torn)
+    recording = Recording(stage.file)
+    found = list(recording.samples())
+    assert not recording.complete
+    assert 500 < len(found) < len(stage.published)
+    assert same(found[-1][1], stage.published[len(found) - 1][1])
+    assert [str(loss) for loss in recording.losses] == ["the recording was not ended: its last 0.1 s may be missing"]
+    report = repair(stage.file, tmp_path / "whole.mcap")
+    assert (report.lost_bytes, report.messages["force"]) == (0, recording.topics["force"].count)
+    assert stage.file.read_bytes() == torn
+    check_official(report.out)
+
+
+def test_what_follows_a_damaged_length_is_found_again(recorded, tmp_path):
+    data = bytearray(recorded.file.read_bytes())
+    scan = Recording(recorded.file)._scan
+    data[scan.chunks[3].offset + 6] ^= 0x10  # the chunk's own length
+    data[scan.chunks[8].offset + scan.chunks[8].length + 2] ^= 0x10  # that of an index
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    recording = Recording(damaged)
+    lost = len(recorded.published) - len(list(recording.samples()))
+    assert 0 < lost < 60
+    assert [loss.what for loss in recording.losses] == ["something is damaged here"] * 2
+    assert recording.topics["force"].gaps + recording.topics["camera"].gaps == lost
+
+
+def test_a_channel_whose_definition_is_damaged_is_known_from_the_summary(recorded, tmp_path):
+    place = Recording(recorded.file)._scan.chunks[0]
+    data = bytearray(recorded.file.read_bytes())
+    data[place.offset + place.length - 1] ^= 1
+    whole, torn = tmp_path / "whole.mcap", tmp_path / "torn.mcap"
+    whole.write_bytes(data)
+    torn.write_bytes(data[:-300])
+    assert Recording(whole).topics["force"].count > 400
+    recording = Recording(torn)
+    assert "force" not in recording.topics
+    assert any("definition is lost" in str(loss) for loss in recording.losses)
+
+
+def test_empty_missing_and_foreign_files_are_named(recorded, tmp_path):
+    file = tmp_path / "x.mcap"
+    with pytest.raises(ConfigError, match="No such file"):
+        Recording(file)
+    file.write_bytes(b"")
+    with pytest.raises(EmptyRecording, match="is empty"):
+        Recording(file)
+    file.write_bytes(recorded.file.read_bytes()[:50])
+    with pytest.raises(EmptyRecording, match="ends before"):
+        Recording(file)
+    file.write_bytes(random.Random(1).randbytes(300_000))
+    with pytest.raises(ForeignRecording, match="no MCAP file"):
+        Recording(file)
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        writer.add_metadata("other", {"schema_version": "9"})
+        writer.finish()
+    with pytest.raises(ForeignRecording, match="did not write it"):
+        Recording(file)
+
+
+def test_a_future_version_is_refused(stage):
+    recorder = stage.recorder()
+    recorder.close()
+    assert Recording(stage.file).topics == {}
+    stage.file.unlink()
+    header = RecordingHeader(schema_version=2, microdrivers="9.1", source="live")
+
+
+    Recorder(stage.file, bus=stage.bus, clock=stage.clock, header=header).close()
+    with pytest.raises(FutureRecording, match="schema version 2; this microdrivers reads up to 1"):
+        Recording(stage.file)
+
+
+def test_times_that_run_backwards_are_counted(stage):
+    with stage.recorder():
+        for t_ns in (5, 9, 7, 8, 20):
+            stage.publish("force", ForceSample(t_ns=t_ns, device="x", force_uN=0.0, raw_uN=0.0))
+    found = Recording(stage.file).topics["force"]
+    assert (found.unsorted, found.first_t_ns, found.last_t_ns) == (1, 5, 20)
+
+
+def test_repair_never_writes_over_anything(recorded, tmp_path):
+    with pytest.raises(ConfigError, match="the file exists"):
+        repair(recorded.file, recorded.file)
+    report = repair(recorded.file, tmp_path / "out.mcap")
+    assert (report.losses, report.messages["force"], report.messages["camera"]) == ([], 500, 10)
+    assert Recording(report.out).attachments == Recording(recorded.file).attachments

@@ -1,0 +1,135 @@
+"""The characterisation, whatever publishes the samples: found again, kept when it ends badly, told in the result."""
+
+import pathlib
+
+import pytest
+
+from microdrivers.core.clock import utc_now
+from microdrivers.core.contact_samples import SpecimenEstimate, VisionForceSample
+from microdrivers.core.errors import DataError, LinkLost
+from microdrivers.recording.indentation_table import IndentationTable
+from microdrivers.report.force_report import force_report_html
+from microdrivers.report.force_summary import force_summary
+from microdrivers.results.force import read_force_result
+from microdrivers.routines.force import Characterisation, IndentationPlayback, build_result
+from microdrivers.routines.provenance import describe_run
+from tests.routines.indentation_source import K1, K2, SPEED_UM_S, B, MadeUpSource
+
+REAL = pathlib.Path(__file__).parents[1] / "data" / "force" / "chiaro_aebp1_30hz.csv"
+
+
+def result_of(run, **known):
+    known = {"source": "made up", "clock": "simulated"} | known
+    return build_result(run, describe_run(known, command="calibrate force", now=utc_now()))
+
+
+@pytest.fixture(scope="module")
+def characterised():
+    source = MadeUpSource()
+    published = {"specimen": [], "force": []}
+    source.bus.topic("estimate/specimen", SpecimenEstimate).subscribe(published["specimen"].append)
+    source.bus.topic("estimate/force", VisionForceSample).subscribe(published["force"].append)
+    run = Characterisation(source, keep_samples=True).run()
+    return source, run, result_of(run), published
+
+
+def test_the_specimen_is_found_again(characterised):
+    _, _, result, _ = characterised
+    single = result.protocols["single"]
+    assert single.k1_uN_per_um == pytest.approx(K1, rel=0.01)
+    assert single.k2_uN_per_um3 == pytest.approx(K2, rel=0.03)
+    assert single.b_uN_s_per_um == pytest.approx(B, rel=0.03)
+    assert result.best == "single"
+    assert not result.misfit.found
+    assert single.m_kg is None
+    assert not single.identifiable.m
+
+
+def test_the_camera_alone_tells_the_force_of_a_fresh_indentation(characterised):
+    source, run, result, published = characterised
+    assert source.indentations == 2
+    assert result.vision_force_error_percent is not None
+    assert result.vision_force_error_percent <= 5.0
+    assert len(published["force"]) == len(run.check.forces)
+    assert result.vision_check.samples > 0.9 * len(run.check.samples) - 20
+
+
+def test_estimates_are_published_while_it_runs(characterised):
+    _, run, _, published = characterised
+    assert published["specimen"] == run.first.estimates
+    assert published["specimen"][-1].valid
+    assert published["specimen"][-1].k1_uN_per_um == pytest.approx(K1, rel=0.2)
+
+
+def test_the_scale_is_part_of_the_uncertainty(characterised):
+    _, run, _, _ = characterised
+    far = run._replace(setup=run.setup._replace(scale_sigma_px_per_um=0.0025))
+    fit = result_of(far).protocols["single"]
+    assert fit.k1_sigma_uN_per_um == pytest.approx(0.01 * fit.k1_uN_per_um, rel=0.02)
+    assert fit.k2_sigma_uN_per_um3 == pytest.approx(0.03 * fit.k2_uN_per_um3, rel=0.02)
+
+
+def test_the_tool_is_away_afterwards(characterised):
+    assert characterised[0].finished == 1
+
+
+def test_the_result_reads_back(characterised, tmp_path):
+    _, _, result, _ = characterised
+    result.write_json(tmp_path / "result.json")
+    assert read_force_result(tmp_path / "result.json") == result
+    result.write_specimen(tmp_path / "specimen.yaml")
+    assert "k1_uN_per_um" in (tmp_path / "specimen.yaml").read_text()
+
+
+def test_page_and_summary_tell_every_protocol(characterised):
+    _, _, result, _ = characterised
+    page, summary = force_report_html(result), force_summary(result)
+    for name in result.protocols:
+        assert name in page
+        assert name in summary
+    assert page.count("<svg") == 4
+    assert "<script" not in page
+    assert max(len(line) for line in summary.splitlines()) <= 120
+
+
+def test_the_same_samples_give_the_same_bits():
+    first, second = (Characterisation(MadeUpSource(seed=4)).run(check=False) for _ in range(2))
+    assert first.first.estimates == second.first.estimates
+    assert result_of(first).protocols == result_of(second).protocols
+
+
+def test_what_was_measured_is_kept_when_it_ends_with_an_error():
+    source = MadeUpSource(broken_off_at=200, error=LinkLost("unplugged"))
+    characterisation = Characterisation(source)
+    with pytest.raises(LinkLost):
+        characterisation.run()
+    assert len(characterisation.first.samples) > 190
+    assert source.finished == 1
+
+
+def test_an_interruption_identifies_what_there_is():
+    source = MadeUpSource(broken_off_at=420, error=KeyboardInterrupt())
+    run = Characterisation(source).run()
+    result = result_of(run)
+    assert not result.complete
+    assert list(result.protocols) == ["loading"]
+    assert result.protocols["loading"].k1_uN_per_um == pytest.approx(K1, rel=0.1)
+    assert source.finished == 1
+
+
+def test_an_interruption_before_anything_touched_is_told():
+    source = MadeUpSource(broken_off_at=20, error=KeyboardInterrupt())
+    with pytest.raises(DataError):
+        Characterisation(source).run()
+    assert source.finished == 1
+
+
+def test_a_real_indentation_is_fitted_as_well_as_it_can_be():
+    run = Characterisation(IndentationPlayback(IndentationTable(REAL))).run()
+    result = result_of(run, clock="recorded")
+    assert 5.0 <= result.protocols["loading"].error_percent <= 5.6  # the best possible is 5.31 %
+    assert result.protocols["single"].error_percent <= 16.0
+    assert not result.protocols["loading"].identifiable.b
+    assert result.misfit.found
+    assert result.vision_force_error_percent is None
+    assert result.setup.speed_um_s >= SPEED_UM_S
