@@ -23,6 +23,7 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 demo: $(READY)
+	@rm -f $(OUT)/run.mcap
 	$(BIN)/microdrivers calibrate optics --seed $(SEED) --out $(OUT)
 
 test: $(READY)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from microdrivers.core.errors import DataError
+from microdrivers.estimators.force.triangles import Six, norm, norm_with_mass, sandwich, without_mass
 
 Array = npt.NDArray[np.float64]
 
@@ -27,9 +28,9 @@ DETERMINED_RIDGES = 100.0
 _ROUNDING = 1e-12
 _SMALLEST_RESIDUAL_SHARE = 1e-6
 
-# φ φᵀ for φ = (x³, x, v) as cc cx cv xx xv vv; with a mass ca xa va aa; then φ F as fc fx fv, and fa; last F².
-_Row = tuple[float, ...]
-_Six = tuple[float, float, float, float, float, float]
+# φ φᵀ for φ = (x³, x, v) as cc cx cv xx xv vv, φ F as fc fx fv, F²; and what a mass adds: ca xa va aa fa.
+_Row = tuple[float, float, float, float, float, float, float, float, float, float]
+_MassRow = tuple[float, float, float, float, float]
 _Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
@@ -58,6 +59,9 @@ class Spread(NamedTuple):
     noise_uN: float
 
 
+_NO_ROW: _Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_NO_MASS: _MassRow = (0.0, 0.0, 0.0, 0.0, 0.0)
+
 UNDETERMINED = Spread(math.inf, False, (), math.nan)
 
 
@@ -85,22 +89,21 @@ class FourSampleRecursion:
         self.ridge = ridge
         self.with_mass = with_mass
         self.samples_used = 0
-        self._no_row: _Row = (0.0,) * (15 if with_mass else 10)
-        self._ridges: _Row = tuple(
-            ridge if k in (0, 3, 5) or (with_mass and k == 9) else 0.0 for k in range(len(self._no_row))
-        )
-        self._normal: Sequence[float] = self._no_row
-        self._squared: Sequence[float] = self._no_row[: 10 if with_mass else 6]
+        self._normal = _NO_ROW
+        self._squared: Six = _NO_ROW[:6]
+        self._mass_normal: Sequence[float] = _NO_MASS
+        self._mass_squared: Sequence[float] = _NO_MASS[:4]
         self._weight_sum = 0.0
         self._ridge_sum = 0.0
         self._theta = (0.0, 0.0, 0.0, 0.0)
-        self._inverse: _Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._inverse: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._spread: Spread | None = UNDETERMINED
         self.restart_stack()
 
     def restart_stack(self) -> None:
         """Let no later stack hold an earlier sample, as at a change of branch; what was summed up stays."""
-        self._stack = (self._no_row, self._no_row, self._no_row)
+        self._stack = (_NO_ROW, _NO_ROW, _NO_ROW)
+        self._mass_stack = (_NO_MASS, _NO_MASS, _NO_MASS)
         self._weights = (0.0, 0.0, 0.0)
         self._in_stack = 0
 
@@ -131,36 +134,65 @@ class FourSampleRecursion:
                 f"a sample is not finite: {x_um} µm, {v_um_s} µm/s, {a_um_s2} µm/s², {force_uN} µN",
                 remedy="leave out samples in which the contact point was lost or the sensor gave no force",
             )
-        row: _Row = (c * c, c * x, c * v, x * x, x * v, v * v)
         if self.with_mass:
-            row += (c * a, x * a, v * a, a * a, c * y, x * y, v * y, a * y, y * y)
-        else:
-            row += (c * y, x * y, v * y, y * y)
-        self._accumulate(row, forgetting)
+            self._accumulate_mass((c * a, x * a, v * a, a * a, a * y), forgetting)
+        self._accumulate((c * c, c * x, c * v, x * x, x * v, v * v, c * y, x * y, v * y, y * y), forgetting)
         self._solve()
         self._spread = None
         self.samples_used += 1
 
     def _accumulate(self, row: _Row, k: float) -> None:
         """R, f and Σ w F² with λ = `k`, and the weights of the samples."""
+        d = self.ridge
         one, two, three = self._stack
-        self._normal = [
-            k * old + (a + b + c + e + d)
-            for old, a, b, c, e, d in zip(self._normal, row, one, two, three, self._ridges, strict=True)
-        ]
-        self._ridge_sum = k * self._ridge_sum + self.ridge
-        # A weight that goes from k·w to k·w + 1 adds 2·k·w + 1 to its square.
+        cc, cx, cv, xx, xv, vv, fc, fx, fv, ff = row
+        cc1, cx1, cv1, xx1, xv1, vv1, fc1, fx1, fv1, ff1 = one
+        cc2, cx2, cv2, xx2, xv2, vv2, fc2, fx2, fv2, ff2 = two
+        cc3, cx3, cv3, xx3, xv3, vv3, fc3, fx3, fv3, ff3 = three
+        old_cc, old_cx, old_cv, old_xx, old_xv, old_vv, old_fc, old_fx, old_fv, old_ff = self._normal
+        self._normal = (
+            k * old_cc + (cc + cc1 + cc2 + cc3 + d),
+            k * old_cx + (cx + cx1 + cx2 + cx3),
+            k * old_cv + (cv + cv1 + cv2 + cv3),
+            k * old_xx + (xx + xx1 + xx2 + xx3 + d),
+            k * old_xv + (xv + xv1 + xv2 + xv3),
+            k * old_vv + (vv + vv1 + vv2 + vv3 + d),
+            k * old_fc + (fc + fc1 + fc2 + fc3),
+            k * old_fx + (fx + fx1 + fx2 + fx3),
+            k * old_fv + (fv + fv1 + fv2 + fv3),
+            k * old_ff + (ff + ff1 + ff2 + ff3),
+        )
+        self._ridge_sum = k * self._ridge_sum + d
         w1, w2, w3 = self._weights
-        g1, g2, g3 = 2.0 * k * w1 + 1.0, 2.0 * k * w2 + 1.0, 2.0 * k * w3 + 1.0
+        g1, g2, g3 = _growth(w1, w2, w3, k)
         kk = k * k
-        self._squared = [
-            kk * old + (a + g1 * b + g2 * c + g3 * e)
-            for old, a, b, c, e in zip(self._squared, row, one, two, three, strict=False)
-        ]
+        old_cc, old_cx, old_cv, old_xx, old_xv, old_vv = self._squared
+        self._squared = (
+            kk * old_cc + (cc + g1 * cc1 + g2 * cc2 + g3 * cc3),
+            kk * old_cx + (cx + g1 * cx1 + g2 * cx2 + g3 * cx3),
+            kk * old_cv + (cv + g1 * cv1 + g2 * cv2 + g3 * cv3),
+            kk * old_xx + (xx + g1 * xx1 + g2 * xx2 + g3 * xx3),
+            kk * old_xv + (xv + g1 * xv1 + g2 * xv2 + g3 * xv3),
+            kk * old_vv + (vv + g1 * vv1 + g2 * vv2 + g3 * vv3),
+        )
         self._in_stack = min(self._in_stack + 1, STACK)
         self._weight_sum = k * self._weight_sum + self._in_stack
         self._stack = (row, one, two)
         self._weights = (1.0, k * w1 + 1.0, k * w2 + 1.0)
+
+    def _accumulate_mass(self, row: _MassRow, k: float) -> None:
+        """The same for the mass's column; before `_accumulate`, which moves the weights on."""
+        one, two, three = self._mass_stack
+        self._mass_normal = [
+            k * old + (a + b + c + e) for old, a, b, c, e in zip(self._mass_normal, row, one, two, three, strict=True)
+        ]
+        self._mass_normal[3] += self.ridge
+        g1, g2, g3 = _growth(*self._weights, k)
+        self._mass_squared = [
+            k * k * old + (a + g1 * b + g2 * c + g3 * e)
+            for old, a, b, c, e in zip(self._mass_squared, row, one, two, three, strict=False)
+        ]
+        self._mass_stack = (row, one, two)
 
     def _solve(self) -> None:
         """Eq. (25) by LDLᵀ, the velocity eliminated first, and the inverse of R's block of x³, x, v."""
@@ -192,7 +224,8 @@ class FourSampleRecursion:
 
     def _reduced(self) -> _Nine:
         """The normal equations with the mass eliminated."""
-        cc, cx, cv, xx, xv, vv, ca, xa, va, aa, fc, fx, fv, fa, _ = self._normal
+        cc, cx, cv, xx, xv, vv, fc, fx, fv, _ = self._normal
+        ca, xa, va, aa, fa = self._mass_normal
         c, x, v = ca / aa, xa / aa, va / aa
         return (
             cc - c * ca, cx - c * xa, cv - c * va, xx - x * xa, xv - x * va, vv - v * va,
@@ -201,8 +234,8 @@ class FourSampleRecursion:
 
     def _mass(self, c: float, x: float, v: float) -> float:
         """θ of the acceleration, given the others."""
-        ca, xa, va, aa = self._normal[6:10]
-        return (self._normal[13] - c * ca - x * xa - v * va) / aa
+        ca, xa, va, aa, fa = self._mass_normal
+        return (fa - c * ca - x * xa - v * va) / aa
 
     # ------------------------------------------------------------------ reading
 
@@ -231,7 +264,7 @@ class FourSampleRecursion:
         cc, cx, cv, xx, xv, vv = self._normal[:6]
         if not self.with_mass:
             return np.array([[cc, cx, cv], [cx, xx, xv], [cv, xv, vv]])
-        ca, xa, va, aa = self._normal[6:10]
+        ca, xa, va, aa, _ = self._mass_normal
         return np.array([[cc, cx, cv, ca], [cx, xx, xv, xa], [cv, xv, vv, va], [ca, xa, va, aa]])
 
     def spread(self) -> Spread:
@@ -242,13 +275,13 @@ class FourSampleRecursion:
 
     def _computed_spread(self) -> Spread:
         if self.with_mass:
-            squared: Sequence[float]
-            squared, of_mass = _without(self._normal, self._squared)
-            largest = math.hypot(_norm(self._normal), math.sqrt(2.0) * math.hypot(*self._normal[6:9]), self._normal[9])
-            weakest = 1.0 / _norm_with_mass(self._inverse, self._normal)
+            ca, xa, va, aa, _ = self._mass_normal
+            squared, of_mass = without_mass((ca, xa, va, aa), self._squared, self._mass_squared)
+            largest = math.hypot(norm(self._normal), math.sqrt(2.0) * math.hypot(ca, xa, va), aa)
+            weakest = 1.0 / norm_with_mass(self._inverse, (ca, xa, va, aa))
         else:
             squared, of_mass = self._squared, 0.0
-            largest, weakest = _norm(self._normal), 1.0 / _norm(self._inverse)
+            largest, weakest = norm(self._normal), 1.0 / norm(self._inverse)
         condition = math.sqrt(largest / weakest)
         enough = self.samples_used >= (4 if self.with_mass else 3)
         if not enough or weakest < max(DETERMINED_RIDGES * self._ridge_sum, _ROUNDING * largest):
@@ -256,18 +289,13 @@ class FourSampleRecursion:
         variance = self._noise_variance(squared, of_mass)
         if variance is None:
             return Spread(condition, True, (), math.nan)
-        return Spread(condition, True, self._sandwich(squared, variance), math.sqrt(variance))
+        return Spread(condition, True, self._covariance(squared, variance), math.sqrt(variance))
 
-    def _noise_variance(self, squared: Sequence[float], of_mass: float) -> float | None:
+    def _noise_variance(self, squared: Six, of_mass: float) -> float | None:
         """Variance of one sample's residual; None where the residuals leave nothing to judge it by."""
         k2, k1, b, m = self._theta
-        normal = self._normal
-        if self.with_mass:
-            fc, fx, fv, fa, ff = normal[10:]
-        else:
-            fc, fx, fv, ff = normal[6:]
-            fa = 0.0
-        fitted = k2 * fc + k1 * fx + b * fv + m * fa
+        fc, fx, fv, ff = self._normal[6:]
+        fitted = k2 * fc + k1 * fx + b * fv + m * self._mass_normal[4]
         residual = ff - fitted - self._ridge_sum * (k2 * k2 + k1 * k1 + b * b + m * m)
         cc, cx, cv, xx, xv, vv = self._inverse
         s_cc, s_cx, s_cv, s_xx, s_xv, s_vv = squared
@@ -277,64 +305,15 @@ class FourSampleRecursion:
             return None
         return max(residual, 0.0) / freedom
 
-    def _sandwich(self, squared: Sequence[float], variance: float) -> tuple[float, ...]:
+    def _covariance(self, squared: Six, variance: float) -> tuple[float, ...]:
         """σ² R⁻¹ (Σ w² φ φᵀ) R⁻¹ of (k1, k2, b), row-major 3 × 3, in µN, µm and s."""
-        cc, cx, cv, xx, xv, vv = self._inverse
-        s_cc, s_cx, s_cv, s_xx, s_xv, s_vv = squared
-        cc2, cx2, cv2 = (
-            cc * s_cc + cx * s_cx + cv * s_cv,
-            cc * s_cx + cx * s_xx + cv * s_xv,
-            cc * s_cv + cx * s_xv + cv * s_vv,
-        )
-        xc2, xx2, xv2 = (
-            cx * s_cc + xx * s_cx + xv * s_cv,
-            cx * s_cx + xx * s_xx + xv * s_xv,
-            cx * s_cv + xx * s_xv + xv * s_vv,
-        )
-        vc2, vx2, vv2 = (
-            cv * s_cc + xv * s_cx + vv * s_cv,
-            cv * s_cx + xv * s_xx + vv * s_xv,
-            cv * s_cv + xv * s_xv + vv * s_vv,
-        )
+        cc, cx, cv, xx, xv, vv = sandwich(self._inverse, squared)
         x_scale, v_scale, _ = self.scales
         k, h, b = 1.0 / x_scale, 1.0 / (x_scale * x_scale * x_scale), 1.0 / v_scale
-        kh = variance * k * h * (xc2 * cc + xx2 * cx + xv2 * cv)
-        kb = variance * k * b * (xc2 * cv + xx2 * xv + xv2 * vv)
-        hb = variance * h * b * (cc2 * cv + cx2 * xv + cv2 * vv)
-        return (
-            variance * k * k * (xc2 * cx + xx2 * xx + xv2 * xv), kh, kb,
-            kh, variance * h * h * (cc2 * cc + cx2 * cx + cv2 * cv), hb,
-            kb, hb, variance * b * b * (vc2 * cv + vx2 * xv + vv2 * vv),
-        )  # fmt: skip
+        kh, kb, hb = variance * k * h * cx, variance * k * b * xv, variance * h * b * cv
+        return (variance * k * k * xx, kh, kb, kh, variance * h * h * cc, hb, kb, hb, variance * b * b * vv)
 
 
-def _norm(triangle: Sequence[float]) -> float:
-    """Frobenius norm of a symmetric 3 × 3 matrix."""
-    cc, cx, cv, xx, xv, vv = triangle[:6]
-    return math.sqrt(cc * cc + xx * xx + vv * vv + 2.0 * (cx * cx + cv * cv + xv * xv))
-
-
-def _norm_with_mass(inverse: _Six, normal: Sequence[float]) -> float:
-    """Frobenius norm of the inverse of R, from the inverse's block without the mass."""
-    cc, cx, cv, xx, xv, vv = inverse
-    ca, xa, va, aa = normal[6:10]
-    c, x, v = ca / aa, xa / aa, va / aa
-    i_ca, i_xa, i_va = cc * c + cx * x + cv * v, cx * c + xx * x + xv * v, cv * c + xv * x + vv * v
-    i_aa = 1.0 / aa + c * i_ca + x * i_xa + v * i_va
-    return math.hypot(_norm(inverse), math.sqrt(2.0) * math.hypot(i_ca, i_xa, i_va), i_aa)
-
-
-def _without(normal: Sequence[float], squared: Sequence[float]) -> tuple[_Six, float]:
-    """Σ w² φ φᵀ of the columns from which the mass's has been taken out as in R, and the mass's part in tr(R⁻¹ S)."""
-    ca, xa, va, aa = normal[6:10]
-    c, x, v = ca / aa, xa / aa, va / aa
-    s_cc, s_cx, s_cv, s_xx, s_xv, s_vv, s_ca, s_xa, s_va, s_aa = squared
-    reduced = (
-        s_cc - 2.0 * c * s_ca + c * c * s_aa,
-        s_cx - c * s_xa - x * s_ca + c * x * s_aa,
-        s_cv - c * s_va - v * s_ca + c * v * s_aa,
-        s_xx - 2.0 * x * s_xa + x * x * s_aa,
-        s_xv - x * s_va - v * s_xa + x * v * s_aa,
-        s_vv - 2.0 * v * s_va + v * v * s_aa,
-    )
-    return reduced, s_aa / aa
+def _growth(w1: float, w2: float, w3: float, k: float) -> tuple[float, float, float]:
+    """A weight that goes from k·w to k·w + 1 adds 2·k·w + 1 to its square."""
+    return 2.0 * k * w1 + 1.0, 2.0 * k * w2 + 1.0, 2.0 * k * w3 + 1.0

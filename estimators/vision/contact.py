@@ -14,7 +14,8 @@ from microdrivers.core.samples import Frame
 from microdrivers.core.units import NS_PER_S, Range, check_range
 from microdrivers.estimators.vision.contact_patch import ContactPatch
 from microdrivers.estimators.vision.moving_tip import TipView
-from microdrivers.estimators.vision.patch import Patch, PatchMatch, locate
+from microdrivers.estimators.vision.patch import Patch, PatchMatch
+from microdrivers.estimators.vision.patch_location import MIN_CORRELATION, locate
 from microdrivers.estimators.vision.points import require_grey
 from microdrivers.estimators.vision.template import FloatArray
 from microdrivers.estimators.vision.visual_contact import ContactEvent, VisualContact
@@ -113,7 +114,7 @@ class DeformationTracker:
         patch: ContactPatch,
         scale: ImageScale | None = None,
         max_speed_um_s: float = 1000.0,
-        min_correlation: float = 0.75,
+        min_correlation: float = MIN_CORRELATION,
         contact: VisualContact | None = None,
     ) -> None:
         check_range(max_speed_um_s, Range(1.0, 1e6), what="max_speed_um_s", unit="µm/s")

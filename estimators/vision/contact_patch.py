@@ -15,15 +15,8 @@ from microdrivers.core.samples import Frame
 from microdrivers.core.units import Range, check_range
 from microdrivers.estimators.vision.motion_segments import even_light
 from microdrivers.estimators.vision.moving_tip import TipView
-from microdrivers.estimators.vision.patch import (
-    MIN_PIXELS,
-    BoolArray,
-    Patch,
-    PatchMatch,
-    locate,
-    locate_along,
-    take_patch,
-)
+from microdrivers.estimators.vision.patch import MIN_PIXELS, BoolArray, Patch, PatchMatch, take_patch
+from microdrivers.estimators.vision.patch_location import locate, locate_along
 from microdrivers.estimators.vision.points import require_grey
 from microdrivers.estimators.vision.template import MARGIN_PX, Float32Array, FloatArray
 

@@ -4,9 +4,10 @@ python-can opens it as `can.Bus(interface="microdrivers", channel=NAME)`; `serve
 port or on a SocketCAN interface. Nothing here imports python-can before it is needed.
 """
 
+from microdrivers.fakes.can.arrival import Arrival
 from microdrivers.fakes.can.frame import Due, Frame, frame_bits
 from microdrivers.fakes.can.medium import BITRATES, Medium, Temper
-from microdrivers.fakes.can.port import Arrival, Port, PortError
+from microdrivers.fakes.can.port import Port, PortError
 from microdrivers.fakes.can.registry import forget_medium, medium_named, shared_medium
 from microdrivers.fakes.can.serving import serve_medium
 from microdrivers.fakes.can.slcan import SlcanAdapter

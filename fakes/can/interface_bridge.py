@@ -6,9 +6,10 @@ import can
 
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import RefusedError, UnsupportedError
+from microdrivers.fakes.can.arrival import Arrival
 from microdrivers.fakes.can.frame import Frame
 from microdrivers.fakes.can.medium import Medium
-from microdrivers.fakes.can.port import Arrival, PortError
+from microdrivers.fakes.can.port import PortError
 
 BUS_OFF_ERROR = 0x040
 """Class of the error frame by which SocketCAN tells of bus-off (linux/can/error.h)."""

@@ -12,9 +12,10 @@ from typing import Literal, NamedTuple
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import seconds_to_ns
+from microdrivers.fakes.can.arrival import PROTOCOL_ERROR
 from microdrivers.fakes.can.frame import Frame
 from microdrivers.fakes.can.pacing import Pacer, RealTimePacer, SimulatedPacer
-from microdrivers.fakes.can.port import PROTOCOL_ERROR, Port, PortError
+from microdrivers.fakes.can.port import Port, PortError
 from microdrivers.fakes.can.timeline import BusTimeline, CanNode
 
 LOG_LENGTH = 20_000

@@ -5,11 +5,12 @@ from __future__ import annotations
 import errno
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from microdrivers.core.clock import ClockError
 from microdrivers.core.errors import LinkError
 from microdrivers.core.units import NS_PER_S, seconds_to_ns
+from microdrivers.fakes.can.arrival import ERROR_FLAG, EXTENDED_FLAG, PROTOCOL_ERROR, REMOTE_FLAG, Arrival, Filter
 from microdrivers.fakes.can.frame import Frame, frame_shape
 from microdrivers.fakes.can.pacing import Pacer
 from microdrivers.fakes.can.timeline import NEVER_NS, BusTimeline
@@ -27,12 +28,6 @@ _LONGEST_WAIT_NS = 3600 * NS_PER_S
 _ERROR_LIMIT = 256
 _ERRORS_AN_ATTEMPT = 8
 
-EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 1 << 31, 1 << 30, 1 << 29
-"""In an identifier, as in linux/can.h."""
-
-PROTOCOL_ERROR = Frame(0x008, bytes(8))
-"""An error frame, as SocketCAN shows it: the class of the error as identifier (linux/can/error.h)."""
-
 
 class PortError(LinkError):
     """The port cannot send or receive; `number` is the errno with which SocketCAN fails in that case."""
@@ -40,21 +35,6 @@ class PortError(LinkError):
     def __init__(self, what: str, *, number: int, remedy: str) -> None:
         super().__init__(what, remedy=remedy)
         self.number = number
-
-
-class Arrival(NamedTuple):
-    """What a port received.
-
-    Attributes:
-        t_ns: when the frame ended on the bus.
-        error: it is an error frame; `frame` then tells its class.
-        own: the port sent it.
-    """
-
-    t_ns: int
-    frame: Frame
-    error: bool = False
-    own: bool = False
 
 
 # From when on the host can read it, and the fields of an `Arrival`. A plain tuple: one is made for each frame.
@@ -89,8 +69,7 @@ class Port:
         self._failure: PortError | None = None
         self._to_send: deque[tuple[int, Frame]] = deque()
         self._received: deque[_Received] = deque()
-        self._filters: tuple[tuple[int, int, bool | None], ...] = ()
-        self._accepted: dict[int, bool] = {}
+        self._filter = Filter(())
         self._arrived = medium.clock.event()
         self._waiting = False
         self._exchanging = False
@@ -228,9 +207,7 @@ class Port:
 
         Without any, all are received. Error frames always are.
         """
-        with self._lock:
-            self._filters = tuple(filters)
-            self._accepted.clear()
+        self._filter = Filter(filters)
 
     def close(self) -> None:
         """Leave the bus; idempotent."""
@@ -262,7 +239,7 @@ class Port:
             frame, error, own = PROTOCOL_ERROR, True, False
         if start_ns < self._opened_ns or self._failure is not None:
             return
-        if self._filters and not (error or own or self._accepts(frame)):
+        if not (error or own or self._filter.accepts(frame)):
             return
         if len(self._received) >= RECEIVE_QUEUE:
             self.dropped_frames += 1
@@ -291,16 +268,6 @@ class Port:
         if self._to_send:
             at_ns, frame = self._to_send[0]
             self._timeline.offer(self, frame, at_ns, self.readable)
-
-    def _accepts(self, frame: Frame) -> bool:
-        key = frame.id | EXTENDED_FLAG if frame.extended else frame.id
-        accepted = self._accepted.get(key)
-        if accepted is None:
-            accepted = self._accepted[key] = any(
-                not (frame.id ^ wanted) & mask and (extended is None or extended == frame.extended)
-                for wanted, mask, extended in self._filters
-            )
-        return accepted
 
     def _choose_call(self) -> None:
         """What the pacer calls when something can be read: nothing if nobody wants to know."""

@@ -9,8 +9,9 @@ import can
 
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import NS_PER_S
+from microdrivers.fakes.can.arrival import Arrival
 from microdrivers.fakes.can.frame import Frame
-from microdrivers.fakes.can.port import Arrival, PortError
+from microdrivers.fakes.can.port import PortError
 from microdrivers.fakes.can.registry import medium_named
 
 

@@ -12,9 +12,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from microdrivers.core.errors import OutOfRange
+from microdrivers.fakes.can.arrival import Arrival
 from microdrivers.fakes.can.frame import Frame
 from microdrivers.fakes.can.medium import BITRATES, Medium
-from microdrivers.fakes.can.port import Arrival, Port, PortError
+from microdrivers.fakes.can.port import Port, PortError
 from microdrivers.fakes.wire import Reply
 
 OK, BELL = b"\r", b"\a"

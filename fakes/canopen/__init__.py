@@ -4,7 +4,8 @@ from microdrivers.fakes.canopen.aborts import AbortCode, SdoAbort
 from microdrivers.fakes.canopen.application import Application, Loss
 from microdrivers.fakes.canopen.communication_objects import Identity
 from microdrivers.fakes.canopen.dictionary import Entry, ObjectDictionary, array
-from microdrivers.fakes.canopen.node import CanOpenNode, NmtState
+from microdrivers.fakes.canopen.nmt import NmtState
+from microdrivers.fakes.canopen.node import CanOpenNode
 from microdrivers.fakes.canopen.pdo_record import PdoDefaults
 from microdrivers.fakes.canopen.temper import PROMPT, Temper
 

@@ -6,7 +6,6 @@ import random
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from enum import IntEnum
 from typing import TypedDict
 
 from microdrivers.core.units import NS_PER_S
@@ -16,6 +15,7 @@ from microdrivers.fakes.canopen.communication_objects import STAY, STOP, Identit
 from microdrivers.fakes.canopen.dictionary import Entry, ObjectDictionary
 from microdrivers.fakes.canopen.emergency import HEARTBEAT_LOST, PDO_LENGTH, Emergencies
 from microdrivers.fakes.canopen.heartbeats import HEARTBEAT_ID, HeartbeatConsumer, HeartbeatProducer
+from microdrivers.fakes.canopen.nmt import COMMANDED_STATES, RESET_COMMUNICATION, RESET_NODE, NmtState
 from microdrivers.fakes.canopen.pdo_record import PdoDefaults
 from microdrivers.fakes.canopen.receive_pdo import ReceivePdo
 from microdrivers.fakes.canopen.sdo_server import SdoServer, is_upload
@@ -27,25 +27,12 @@ _NMT_ID = 0x000
 _SDO_REQUEST_ID, _SDO_REPLY_ID = 0x600, 0x580
 _TPDO_IDS, _RPDO_IDS = (0x180, 0x280, 0x380, 0x480), (0x200, 0x300, 0x400, 0x500)
 _ID = 0x7FF
-_RESET_NODE, _RESET_COMMUNICATION = 0x81, 0x82
 _LONG_AGO_NS = -(1 << 62)
 _CLOCK_ERROR = 50e-6
 """Largest relative error of the node's own clock."""
 
 Handler = Callable[[Frame, int], bool]
 """Acts on a frame that ended at that time; tells whether anything that falls due by itself may have moved."""
-
-
-class NmtState(IntEnum):
-    """The states, as a heartbeat tells them."""
-
-    INITIALISING = 0x00
-    STOPPED = 0x04
-    OPERATIONAL = 0x05
-    PRE_OPERATIONAL = 0x7F
-
-
-_COMMANDED_STATES = {0x01: NmtState.OPERATIONAL, 0x02: NmtState.STOPPED, 0x80: NmtState.PRE_OPERATIONAL}
 
 
 class CanOpenNode:
@@ -235,10 +222,10 @@ class CanOpenNode:
         if len(frame.data) < 2 or frame.data[1] not in (0, self.node_id):
             return False
         command = frame.data[0]
-        if command in _COMMANDED_STATES:
-            self._enter(_COMMANDED_STATES[command], t_ns)
-        elif command in (_RESET_NODE, _RESET_COMMUNICATION):
-            self._restart(t_ns, self._temper.reset_s, communication_only=command == _RESET_COMMUNICATION)
+        if command in COMMANDED_STATES:
+            self._enter(COMMANDED_STATES[command], t_ns)
+        elif command in (RESET_NODE, RESET_COMMUNICATION):
+            self._restart(t_ns, self._temper.reset_s, communication_only=command == RESET_COMMUNICATION)
         return True
 
     def _enter(self, state: NmtState, t_ns: int) -> None:

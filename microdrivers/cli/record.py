@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -52,8 +52,8 @@ def record(
 ) -> None:
     """Record all devices of the rig file RIG to an MCAP file, until Ctrl-C or for a given time. Nothing moves.
 
-    Force comes at its sensor's rate, frames at their camera's, poses at 100 Hz, the zoom at 70 Hz. The file is complete after Ctrl-C, and
-    whatever kills the program costs the last 0.1 s at most: see `microdrivers recording repair`.
+    Force comes at its sensor's rate, frames at their camera's, poses at 100 Hz, the zoom at 70 Hz. The file is
+    complete after Ctrl-C, and whatever kills the program costs the last 0.1 s: see `microdrivers recording repair`.
 
     \b
     Examples:
@@ -76,8 +76,8 @@ def record(
     rig = choice.build(real_time=real_time)
     try:
         header = describe_recording(
-            source="fake" if rig.fake or rig.file.emulated else "live", seed=(choice.seed or 0) if choice.fake else None,
-            rig=rig.file.name,
+            source="fake" if rig.fake or rig.file.emulated else "live", rig=rig.file.name,
+            seed=(choice.seed or 0) if choice.fake else None,
         )  # fmt: skip
         recorder = Recorder(
             out or _default_file(rig), bus=rig.bus, clock=rig.clock, header=header, topics=patterns,
@@ -112,7 +112,7 @@ def _attach_rig(recorder: Recorder, rig: Rig) -> None:
     recorder.attach("rig.yaml", text.encode(), "application/yaml")
 
 
-def _rate_hz(device: Device[object]) -> float:
+def _rate_hz(device: Device[Any]) -> float:
     from microdrivers.devices.camera import Camera
     from microdrivers.routines.stream_check import usual_rate_hz
 

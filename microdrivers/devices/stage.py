@@ -110,6 +110,11 @@ class Stage(Device[PoseT]):
         """Whether somebody is about to set the stage in motion, or is searching a reference."""
         return self._move.commanding
 
+    @property
+    def commanded_ns(self) -> int:
+        """When the last move had been commanded, ns; −1 before the first."""
+        return self._commanded_ns
+
     def reference(self, axes: Sequence[str]) -> None:
         """Find the reference of the named axes, in exactly that order. Moves the stage to its switches.
 

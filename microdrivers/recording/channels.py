@@ -15,8 +15,10 @@ _WIRE_SUFFIX = "/wire"
 def is_wanted(topic: str, patterns: Collection[str] | None) -> bool:
     """Whether a topic is asked for: named, or matched by a pattern such as `truth/*`.
 
-    None asks for all but the bytes on the wires (`*/wire`): drivers make these only while somebody listens.
+    None asks for all but the bytes on the wires, which drivers make only while somebody listens: these are to be asked
+    for by a pattern that ends in `/wire`.
     """
+    wire = topic.endswith(_WIRE_SUFFIX)
     if patterns is None:
-        return not topic.endswith(_WIRE_SUFFIX)
-    return any(fnmatchcase(topic, pattern) for pattern in patterns)
+        return not wire
+    return any(fnmatchcase(topic, pattern) for pattern in patterns if not wire or pattern.endswith(_WIRE_SUFFIX))

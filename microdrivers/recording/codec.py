@@ -128,14 +128,18 @@ def decoder_for(message_type: type[MessageT], schema: bytes) -> Callable[[bytes]
     With another schema than the present one, fields are matched by name, new ones take their default, and those that
     there are no more are left out. A message that does not fit raises `ValueError` or `TypeError`.
     """
-    library = functools.cache(lambda: _library_decoder(message_type, schema))
+
+    @functools.cache
+    def library() -> Callable[[bytes], MessageT]:
+        return _library_decoder(message_type, schema)
+
     if schema != schema_data(message_type):
         return library()
-    decode_usual = codec_of(message_type).decode
+    codec: Codec[MessageT] = codec_of(message_type)
 
     def decode(data: bytes) -> MessageT:
         try:
-            return decode_usual(data)
+            return codec.decode(data)
         except UnusualLayout:
             return library()(data)
 

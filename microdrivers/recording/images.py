@@ -1,4 +1,4 @@
-"""Camera frames as foxglove.RawImage, which Foxglove and Rerun show, with everything else in a `FrameInfo` beside it."""
+"""Camera frames as foxglove.RawImage, which Foxglove and Rerun show, and all else of them in a `FrameInfo`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ INFO_SUFFIX = "/info"
 
 _INFO_FIELDS = FrameInfo.__struct_fields__
 _ENCODINGS: dict[str, np.dtype[Any]] = {"mono8": np.dtype("u1"), "mono16": np.dtype("<u2")}
-_STAMP, _FRAME_ID, _WIDTH, _HEIGHT, _ENCODING, _STEP, _DATA = b"\x0a", b"\x3a", b"\x15", b"\x1d", b"\x22", b"\x2d", b"\x32"
+_STAMP, _WIDTH, _HEIGHT, _ENCODING = b"\x0a", b"\x15", b"\x1d", b"\x22"
+_STEP, _DATA, _FRAME_ID = b"\x2d", b"\x32", b"\x3a"
 
 
 class WrittenImage(NamedTuple):

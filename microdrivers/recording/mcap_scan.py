@@ -64,8 +64,7 @@ class Loss(NamedTuple):
 
 
 class ChunkPlace(NamedTuple):
-    """Where a chunk is; `holds` tells how many messages of which channel there
-    are in it, as the index behind it says, which nothing vouches for."""
+    """Where a chunk is; `holds`: how many messages of which channel, as its index says, which nothing vouches for."""
 
     offset: int
     length: int
@@ -207,7 +206,9 @@ class McapScan:
             for found in _CHUNK_PATTERN.finditer(block):
                 start = offset + found.start()
                 length = self._plausible(start) if found.start() < _BLOCK_BYTES else None
-                if length is not None and isinstance(self.read_chunk(ChunkPlace(start, length, {}, compressed=False)), bytes):
+                if length is not None and isinstance(
+                    self.read_chunk(ChunkPlace(start, length, {}, compressed=False)), bytes
+                ):
                     return start
             offset += _BLOCK_BYTES
         return self.size

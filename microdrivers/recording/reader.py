@@ -198,20 +198,12 @@ def read_header(scan: McapScan) -> RecordingHeader:
         raise EmptyRecording(f"{file} is empty", remedy="record anew: nothing was written to it")
     records = [record.metadata for record in scan.metadata if record.name == HEADER_RECORD]
     headers = [header for data in records if (header := from_metadata(data, RecordingHeader)) is not None]
+    if headers:
+        _check_version(file, headers[0].schema_version, headers[0].microdrivers)
+        return headers[0]
     for data in records:
         number = data.get("schema_version", "")
-        if not headers and number.isdecimal() and int(number) > SCHEMA_VERSION:
-            raise FutureRecording(
-                f"{file} has schema version {number}; this microdrivers reads up to {SCHEMA_VERSION}",
-                remedy=f"install microdrivers {data.get('microdrivers', '')} or newer".replace("  ", " "),
-            )
-    if headers:
-        if headers[0].schema_version > SCHEMA_VERSION:
-            raise FutureRecording(
-                f"{file} has schema version {headers[0].schema_version}; this microdrivers reads up to {SCHEMA_VERSION}",
-                remedy=f"install microdrivers {headers[0].microdrivers} or newer",
-            )
-        return headers[0]
+        _check_version(file, int(number) if number.isdecimal() else 0, data.get("microdrivers", ""))
     if scan.profile == PROFILE and scan.chunks:
         scan.losses.append(Loss(0, 0, "the recording's header is damaged: who made it is not known"))
         return RecordingHeader(source="recorded")
@@ -219,3 +211,11 @@ def read_header(scan: McapScan) -> RecordingHeader:
         raise EmptyRecording(f"{file} ends before its first complete record", remedy="record anew")
     what = "an MCAP file, but microdrivers did not write it" if scan.has_magic else "no MCAP file"
     raise ForeignRecording(f"{file} is {what}", remedy="name a file that `microdrivers record` has written")
+
+
+def _check_version(file: Path, number: int, writer: str) -> None:
+    if number > SCHEMA_VERSION:
+        raise FutureRecording(
+            f"{file} has schema version {number}; this microdrivers reads up to {SCHEMA_VERSION}",
+            remedy=f"install microdrivers {writer or 'as it wrote the file'} or newer",
+        )

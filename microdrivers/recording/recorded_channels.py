@@ -81,12 +81,14 @@ class SampleReader(ChannelReader):
         self._decode = decoder_for(sample_type, schema)
 
     def take(self, data: Any, _sequence: int) -> Sample | None:
+        """As in `ChannelReader`."""
         try:
             return self._decode(data)
         except _MISFITS as error:
             raise _misfit(error) from error
 
     def stamps(self, data: Any, sequence: int) -> tuple[int, int] | None:
+        """As in `ChannelReader`."""
         if len(data) >= _STAMPS.size:
             t_tag, t_ns, dt_tag, _, seq_tag, seq = _STAMPS.unpack_from(data)
             if (t_tag, dt_tag, seq_tag) == _STAMP_TAGS:
@@ -128,10 +130,12 @@ class InfoReader(ChannelReader):
         self._decode = _safely(decoder_for(FrameInfo, schema))
 
     def take(self, data: Any, sequence: int) -> Sample | None:
+        """As in `ChannelReader`."""
         self._frame.put(self._decode(data), sequence)
         return None
 
     def stamps(self, data: Any, sequence: int) -> tuple[int, int] | None:
+        """As in `ChannelReader`."""
         self.take(data, sequence)
         return None
 
@@ -147,6 +151,7 @@ class ImageReader(ChannelReader):
         self._frame = frame
 
     def take(self, data: Any, sequence: int) -> Sample | None:
+        """As in `ChannelReader`."""
         info = self._frame.claim(sequence)
         try:
             return frame_of(info, decode_image(data))
@@ -154,6 +159,7 @@ class ImageReader(ChannelReader):
             raise Unreadable(str(error)) from error
 
     def stamps(self, _data: Any, sequence: int) -> tuple[int, int] | None:
+        """As in `ChannelReader`."""
         info = self._frame.claim(sequence)
         return info.t_ns, info.seq
 
@@ -166,9 +172,11 @@ class NoteReader(ChannelReader):
         self.note: Callable[[bytes], Arrivals | Drops] = _safely(decoder_for(kind, schema))
 
     def take(self, _data: Any, _sequence: int) -> Sample | None:
+        """As in `ChannelReader`."""
         return None
 
     def stamps(self, _data: Any, _sequence: int) -> tuple[int, int] | None:
+        """As in `ChannelReader`."""
         return None
 
 
@@ -180,6 +188,7 @@ class UnknownReader(ChannelReader):
         self._what = what
 
     def take(self, _data: Any, _sequence: int) -> Sample | None:
+        """As in `ChannelReader`."""
         raise Unreadable(self._what)
 
     stamps = take  # type: ignore[assignment]

@@ -127,8 +127,8 @@ class _Copy:
         if schema.name == schema_name(FrameInfo):
             self._writer.flush()
         if schema.name == IMAGE_SCHEMA:
-            self._writer.add_image(new, b"", memoryview(chunk)[body:end], sequence=sequence, log_ns=log_ns, publish_ns=publish_ns)
-        else:
-            self._writer.add_message(
-                new, chunk[body:end], sequence=sequence, log_ns=log_ns, publish_ns=publish_ns
+            self._writer.add_image(
+                new, b"", memoryview(chunk)[body:end], sequence=sequence, log_ns=log_ns, publish_ns=publish_ns
             )
+        else:
+            self._writer.add_message(new, chunk[body:end], sequence=sequence, log_ns=log_ns, publish_ns=publish_ns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import msgspec
@@ -11,7 +11,14 @@ import msgspec
 from microdrivers.core.samples import Frame, Sample
 from microdrivers.recording.channels import ARRIVALS_TOPIC, DROPS_TOPIC
 from microdrivers.recording.codec import Codec, codec_of
-from microdrivers.recording.header import CLOCK_RECORD, HEADER_RECORD, PROFILE, ClockMapping, RecordingHeader, to_metadata
+from microdrivers.recording.header import (
+    CLOCK_RECORD,
+    HEADER_RECORD,
+    PROFILE,
+    ClockMapping,
+    RecordingHeader,
+    to_metadata,
+)
 from microdrivers.recording.images import IMAGE_SCHEMA, INFO_SUFFIX, encode_image, image_schema, info_of
 from microdrivers.recording.mcap_writer import ChannelKey, LostChunk, McapWriter, Output
 from microdrivers.recording.schemas import Arrivals, Drops, FrameInfo, schema_data, schema_name
@@ -201,9 +208,7 @@ class SampleFile:
             OSError: it could not be written; what the file holds can be read all the same.
         """
         self.flush(now_ns=now_ns)
-        clock = msgspec.structs.replace(
-            self._clock, end_offset_ns=end.offset_ns, end_uncertainty_ns=end.uncertainty_ns
-        )
+        clock = msgspec.structs.replace(self._clock, end_offset_ns=end.offset_ns, end_uncertainty_ns=end.uncertainty_ns)
         self._writer.add_metadata(HEADER_RECORD, to_metadata(self._header))
         self._writer.add_metadata(CLOCK_RECORD, to_metadata(clock))
         self._writer.finish()

@@ -8,7 +8,6 @@ numbers 1 to 15, a type's own begin at 16.
 from __future__ import annotations
 
 import functools
-
 from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 

@@ -167,7 +167,7 @@ class ForceGuard:
             return
         self._flow.heard(sample.t_ns)
         if self._is_over(force_uN):
-            self._hold_over_limit(force_uN)
+            self._hold_over_limit(force_uN, sample.t_ns)
         elif self.tripped and abs(force_uN) <= _BELOW_SHARE * self.settings.max_force_uN:
             self._end_trip()
 
@@ -185,7 +185,7 @@ class ForceGuard:
 
     # ------------------------------------------------------------------ too much force
 
-    def _hold_over_limit(self, force_uN: float) -> None:
+    def _hold_over_limit(self, force_uN: float, t_ns: int) -> None:
         stage, reason = self._stage, self._excess(force_uN)
         with self._lock:
             is_new, self.tripped = not self.tripped, self.tripped or reason
@@ -193,7 +193,7 @@ class ForceGuard:
         if is_new:
             self._least_uN = math.inf
         if retracting:
-            self._watch_retraction(stage, force_uN)
+            self._watch_retraction(stage, force_uN, t_ns)
         elif is_new:
             self._trip(reason, force_uN, retract=self._armed and stage is not None)
         else:
@@ -217,10 +217,10 @@ class ForceGuard:
         ]
         return [*([own] if own is not None else []), *others]
 
-    def _watch_retraction(self, stage: FineStage | None, force_uN: float) -> None:
+    def _watch_retraction(self, stage: FineStage | None, force_uN: float, t_ns: int) -> None:
         """Stop a retraction that makes it worse; from then on only a person knows what to do."""
-        if stage is None or not stage.retracting or stage.being_commanded:
-            return  # it has not begun, and what was stopped may still brake
+        if stage is None or not stage.retracting or stage.being_commanded or t_ns < stage.commanded_ns:
+            return  # the reading is from before it began, when what had been stopped was still braking
         self._least_uN = min(self._least_uN, abs(force_uN))
         if not abs(force_uN) > self._least_uN + _WORSE_SHARE * self.settings.max_force_uN:
             return

@@ -18,7 +18,7 @@ from microdrivers.core.errors import (
 )
 from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.force_sensor import STALE, UNTARED
-from microdrivers.fakes.can import Frame
+from microdrivers.fakes.can import Due, Frame
 from tests.backends.cia404_bench import ForceBench
 from tests.backends.cia404_peer import NOT_NOW, READ_ONLY, SheetAmplifier
 
@@ -257,14 +257,14 @@ class _Once:
         self._frame = frame
         self._due_ns: int | None = due_ns
 
-    def receive(self, frame: Frame, t_ns: int) -> list[tuple[int, Frame]]:
+    def receive(self, frame: Frame, t_ns: int) -> list[Due]:
         return []
 
-    def advance(self, t_ns: int) -> list[tuple[int, Frame]]:
+    def advance(self, t_ns: int) -> list[Due]:
         if self._due_ns is None:
             return []
         self._due_ns = None
-        return [(t_ns, self._frame)]
+        return [Due(t_ns, self._frame)]
 
     def next_event_ns(self) -> int | None:
         return self._due_ns

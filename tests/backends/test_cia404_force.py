@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import struct
-from typing import Any
 
 import pydantic
 import pytest
@@ -18,7 +17,7 @@ from microdrivers.backends.cia404.physical_unit import uN_per_unit
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import NS_PER_MS, NS_PER_S, Range
 from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, UNTARED
-from microdrivers.fakes.can import Frame, frame_bits
+from microdrivers.fakes.can import Due, Frame, frame_bits
 from tests.backends.cia404_bench import RIG, ForceBench
 from tests.backends.cia404_peer import OPERATIONAL, PRE_OPERATIONAL, SheetAmplifier
 
@@ -182,12 +181,12 @@ class _Chatter:
     def __init__(self) -> None:
         self._due_ns = 0
 
-    def receive(self, frame: Frame, t_ns: int) -> list[Any]:
+    def receive(self, frame: Frame, t_ns: int) -> list[Due]:
         return []
 
-    def advance(self, t_ns: int) -> list[Any]:
+    def advance(self, t_ns: int) -> list[Due]:
         due_ns, self._due_ns = self._due_ns, self._due_ns + 613_000
-        return [(due_ns, Frame(0x7F0, bytes(8)))]
+        return [Due(due_ns, Frame(0x7F0, bytes(8)))]
 
     def next_event_ns(self) -> int | None:
         return self._due_ns

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import pytest
 
-from microdrivers.fakes.can import Frame
+from microdrivers.fakes.can import Due, Frame
 from tests.backends.cia404_bench import ForceBench
 
 
@@ -19,12 +18,12 @@ class Bursts:
         self._every_ns = every_ns
         self._due_ns = 0
 
-    def receive(self, frame: Frame, t_ns: int) -> list[Any]:
+    def receive(self, frame: Frame, t_ns: int) -> list[Due]:
         return []
 
-    def advance(self, t_ns: int) -> list[Any]:
+    def advance(self, t_ns: int) -> list[Due]:
         due_ns, self._due_ns = self._due_ns, self._due_ns + self._every_ns
-        return [(due_ns, Frame(0x001, bytes(8))) for _ in range(self._frames)]
+        return [Due(due_ns, Frame(0x001, bytes(8))) for _ in range(self._frames)]
 
     def next_event_ns(self) -> int | None:
         return self._due_ns

@@ -19,7 +19,8 @@ from microdrivers.fakes.can import (
     shared_medium,
 )
 from microdrivers.fakes.can import medium as medium_module
-from microdrivers.fakes.can.port import PROTOCOL_ERROR, RECEIVE_QUEUE, TRANSMIT_QUEUE
+from microdrivers.fakes.can.arrival import PROTOCOL_ERROR
+from microdrivers.fakes.can.port import RECEIVE_QUEUE, TRANSMIT_QUEUE
 from tests.fakes.can_bench import BIT_NS, Listener, Periodic
 
 START_NS = NS_PER_S

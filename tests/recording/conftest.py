@@ -88,5 +88,3 @@ def recorded(stage):
         recorder.attach("rig.yaml", b"name: test\n", "application/yaml")
         stage.run()
     return stage
-
-

@@ -2,6 +2,7 @@
 
 import errno
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,12 +62,16 @@ def test_topics_are_chosen_by_pattern_and_wires_by_name_only(stage):
         stage.publish("cell/wire", traffic)
         assert not stage.bus.topic("cell/wire", WireTraffic).heard
     stage.file.unlink()
-    with stage.recorder(topics=["*/wire", "force"]):
+    with stage.recorder(topics=["*/wire", "forc*"]):
         stage.force(0)
         stage.force(0, topic="other")
         stage.publish("cell/wire", traffic)
     assert [topic for topic, _ in read(stage.file)] == ["force", "cell/wire"]
     assert [topic for topic, _ in Recording(stage.file).samples(["f*"])] == ["force"]
+    stage.file.unlink()
+    with stage.recorder(topics=["cell*"]):
+        stage.publish("cell/wire", traffic)
+    assert read(stage.file) == []
 
 
 def test_frames_can_be_left_out(recorded):
@@ -94,7 +99,8 @@ def test_a_view_of_an_image_is_recorded_as_it_looks(stage):
     with stage.recorder() as recorder:
         for _, frame in stage.published:
             stage.bus.topic("camera", Frame).publish(frame)
-    assert all(np.array_equal(f.image, p.image) for (_, f), (_, p) in zip(read(stage.file), stage.published, strict=True))
+    pairs = zip(read(stage.file), stage.published, strict=True)
+    assert all(np.array_equal(frame.image, given.image) for (_, frame), (_, given) in pairs)
     assert recorder.counts["camera"].dropped == 0
 
 
@@ -150,7 +156,7 @@ class FullDisk:
     """A file on a disk with so much space, which may get more; a write that does not fit is done in part."""
 
     def __init__(self, file, space):
-        self._file = file.open("xb", buffering=0)
+        self._file = file.open("wb", buffering=0)
         self.space = space
 
     def write(self, data):
@@ -201,7 +207,7 @@ def test_a_full_disk_stops_the_program_if_that_is_wanted(stage, full_disk):
 
 
 def test_a_device_that_is_always_full(stage, monkeypatch):
-    monkeypatch.setattr(recorder_module, "create_file", lambda _file: open("/dev/full", "wb", buffering=0))  # noqa: PTH123
+    monkeypatch.setattr(recorder_module, "create_file", lambda _file: FullDisk(Path("/dev/full"), 10**9))
     with pytest.raises(ConfigError, match="No space left"):
         stage.recorder()
 

@@ -1,0 +1,100 @@
+"""record and recording repair: what the devices of a rig tell, in a file that others read."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from microdrivers.configs import shipped_rig
+from microdrivers.core.contact_samples import SpecimenTruth
+from microdrivers.core.samples import ForceSample, Frame
+from microdrivers.recording.reader import Recording
+
+
+def test_record_takes_all_that_an_emulated_rig_tells(run, tmp_path):
+    result = run("record", shipped_rig("workstation"), "--fake", "--seed", 2, "--for", 0.25, "--out", "a.mcap")
+    assert result.exit_code == 0, result.output
+    recording = Recording(tmp_path / "a.mcap")
+    topics = recording.topics
+    assert recording.losses == []
+    assert (recording.header.source, recording.header.seed, recording.header.rig) == ("fake", 2, "workstation")
+    assert topics["truth/specimen"].sample_type is SpecimenTruth
+    assert topics["probe_force"].sample_type is ForceSample
+    assert topics["probe_force"].rate_hz == pytest.approx(1000, rel=0.01)
+    assert topics["probe_stage"].rate_hz == pytest.approx(100, rel=0.01)
+    assert topics["camera_fine"].sample_type is Frame
+    assert topics["camera_fine"].rate_hz == pytest.approx(30, rel=0.01)
+    kinds = [sample.kind for _, sample in recording.samples(["camera_fine/event"])]
+    assert (kinds[0], kinds[-1]) == ("opened", "closed")
+    assert yaml.safe_load(recording.attachments["rig.yaml"])["name"] == "workstation"
+    assert "probe_force" in result.stdout
+    assert "0 dropped" in result.stderr
+
+
+def test_record_takes_the_topics_that_are_named(run, tmp_path):
+    result = run(
+        "record",
+        shipped_rig("workstation"),
+        "--fake",
+        "--for",
+        0.2,
+        "--out",
+        "a.mcap",
+        "--topics",
+        "probe_force, sample_*",
+    )
+    assert result.exit_code == 0, result.output
+    assert set(Recording(tmp_path / "a.mcap").topics) == {"probe_force", "sample_stage", "sample_stage/event"}
+
+
+def test_record_needs_an_end_where_time_flies_and_a_file_that_is_new(run, tmp_path):
+    result = run("record", shipped_rig("microscope"), "--fake")
+    assert result.exit_code == 1
+    assert "add --for S, or --real-time" in result.stderr
+    (tmp_path / "a.mcap").write_text("mine")
+    result = run("record", shipped_rig("microscope"), "--fake", "--for", 1, "--out", "a.mcap")
+    assert result.exit_code == 1
+    assert "never written over" in result.stderr
+    assert (tmp_path / "a.mcap").read_text() == "mine"
+
+
+def test_repair_tells_what_was_kept_and_lost(run, tmp_path):
+    run("record", shipped_rig("microscope"), "--fake", "--for", 0.3, "--out", "a.mcap")
+    whole = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(whole[: len(whole) // 2])
+    result = run("recording", "repair", "a.mcap")
+    assert result.exit_code == 0, result.output
+    assert "the recording was not ended" in result.stdout
+    assert f"of {len(whole) // 2} bytes" in result.stdout
+    assert Recording(tmp_path / "a.repaired.mcap").losses == []
+    assert run("recording", "repair", "a.mcap").exit_code == 1
+    result = run("recording", "repair", "a.repaired.mcap", "--out", "b.mcap")
+    assert "nothing was lost" in result.stdout
+    (tmp_path / "c.mcap").write_text("no recording of anything")
+    result = run("recording", "repair", "c.mcap")
+    assert result.exit_code == 1
+    assert "no MCAP file" in result.stderr
+
+
+@pytest.mark.xdist_group("real_time")
+def test_ctrl_c_ends_a_recording_that_is_complete(tmp_path):
+    file = tmp_path / "a.mcap"
+    command = [sys.executable, "-m", "microdrivers", "record", str(shipped_rig("microscope")), "--fake", "--real-time"]
+    with subprocess.Popen([*command, "--out", str(file)], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 60
+        while not (file.exists() and file.stat().st_size > 2_000_000):
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        os.kill(process.pid, signal.SIGINT)
+        told, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert b"the file is complete" in told
+    recording = Recording(file)
+    assert recording.complete
+    assert recording.losses == []
+    assert recording.topics["camera_fine"].count > 2

@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+
+from microdrivers.core.errors import DataError, NoContact, SaturatedData, TargetLost
+from microdrivers.estimators.force.record import IndentationRecord, check, runs, saturated, white_sigma
+from tests.estimators.force.indentations import part, real, recorded
+
+
+def changed(record: IndentationRecord, column: str, place, value) -> IndentationRecord:
+    values = getattr(record, column).copy()
+    values[place] = value
+    return record._replace(**{column: values})
+
+
+@pytest.fixture(scope="module")
+def good():
+    return recorded("single")
+
+
+@pytest.mark.parametrize("preset", ["single", "unloading_springs", "slip_corrected", "viscoelastic"])
+def test_good_records_pass(preset):
+    check(recorded(preset))
+    check(recorded(preset, stated=False))
+
+
+def test_the_real_record_passes():
+    check(real())
+
+
+def refused(record: IndentationRecord, kind: type[DataError], match: str) -> None:
+    with pytest.raises(kind, match=match) as caught:
+        check(record)
+    assert caught.value.remedy
+
+
+def test_time_must_increase(good):
+    refused(changed(good, "time_s", 300, good.time_s[299]), DataError, "time does not increase after")
+    refused(changed(good, "time_s", 300, np.nan), DataError, "time_s is not a number")
+
+
+@pytest.mark.parametrize("column", ["deformation_um", "force_uN"])
+def test_nan_is_refused_unless_marked_as_lost(good, column):
+    holed = changed(good, column, slice(300, 310), np.nan)
+    refused(holed, DataError, f"{column} is not a number in 10 samples")
+    unseen = np.zeros(len(good.time_s), dtype=bool)
+    unseen[300:310] = True
+    check(holed._replace(lost=unseen))
+
+
+def test_a_gap_is_refused_and_a_dropped_frame_is_not(good):
+    def without(start, stop):
+        kept = np.delete(np.arange(len(good.time_s)), np.arange(start, stop))
+        return IndentationRecord(good.time_s[kept], good.deformation_um[kept], good.force_uN[kept], 0.06, 0.05)
+
+    check(without(300, 302))
+    refused(without(300, 330), DataError, r"gap of 1\.0")
+
+
+def test_a_force_in_millinewtons_is_noticed(good):
+    mN = good._replace(force_uN=good.force_uN / 1000.0)
+    refused(mN._replace(force_sigma_uN=0.0), DataError, "implausible units")
+    refused(mN, DataError, "implausible units")
+
+
+def test_other_units_are_noticed(good):
+    refused(good._replace(deformation_um=good.deformation_um * 1000.0), DataError, "implausible units")
+    refused(good._replace(deformation_um=good.deformation_um / 1e6, deformation_sigma_um=0.0), DataError, "implausible")
+    refused(good._replace(force_uN=good.force_uN * 1000.0), DataError, "implausible units: a force of")
+    # 30 µm deep in µN of noise 0.05: the modulus alone would be that of a soft gel.
+    shallow = part(good, 0.0, 10.0)
+    refused(shallow._replace(force_uN=shallow.force_uN / 1000.0), DataError, "implausible units")
+
+
+def test_no_contact_is_told_from_a_weak_one(good):
+    before = part(good, 0.0, 4.0)
+    moving = before._replace(deformation_um=before.deformation_um + 5.0 * before.time_s)
+    refused(moving, NoContact, "no contact")
+    refused(good._replace(force_uN=np.full_like(good.force_uN, 1.5)), DataError, "the force is constant")
+
+
+def test_a_force_of_the_wrong_sign_is_refused(good):
+    refused(good._replace(force_uN=-good.force_uN), DataError, "pulls")
+
+
+def test_a_deformation_that_does_not_change_is_refused(good):
+    refused(good._replace(deformation_um=np.zeros_like(good.time_s)), DataError, "which is its noise")
+
+
+def test_too_short_or_uneven_columns(good):
+    refused(part(good, 0.0, 0.5), DataError, "at least 20 are needed")
+    refused(good._replace(force_uN=good.force_uN[:-1]), DataError, "differ in length")
+
+
+def test_saturation_is_found_and_only_refused_if_it_is_most_of_the_record(good):
+    clipped = good._replace(force_uN=np.minimum(good.force_uN, 500.0))
+    check(clipped)
+    assert np.array_equal(saturated(clipped), good.force_uN >= 500.0)
+    assert not saturated(good).any()
+    refused(good._replace(force_uN=np.minimum(good.force_uN, 5.0)), SaturatedData, "end of its range")
+    said = good.force_uN > 400.0
+    assert np.array_equal(saturated(good._replace(saturated=said)), said)
+
+
+def test_a_record_without_the_contact_point_is_refused(good):
+    unseen = good.time_s > 10.0
+    refused(good._replace(lost=unseen), TargetLost, "lost in")
+
+
+def test_white_sigma_sees_the_noise_and_not_the_curve():
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 30.0, 900)
+    curve = np.abs(np.sin(t / 3.0)) * 100.0
+    assert white_sigma(curve + 0.05 * rng.standard_normal(900)) == pytest.approx(0.05, rel=0.15)
+    assert np.isnan(white_sigma(curve[:8]))
+
+
+def test_runs_are_half_open():
+    assert runs(np.array([True, False, True, True])) == [(0, 1), (2, 4)]
+    assert runs(np.array([False])) == []
