@@ -29,6 +29,8 @@ _STATED_OVER_OBSERVED_NOISE = (300.0, 3000.0)
 """Of a force in mN whose noise is stated in µN."""
 
 _USABLE_SHARE = 0.5
+_PRESSES = 0.02
+_UNITS = "give time_s in s, deformation in µm and force in µN (1 mN is 1000 µN)"
 
 
 class IndentationRecord(NamedTuple):
@@ -156,6 +158,12 @@ def _check_time(time_s: Array) -> None:
 
 
 def _check_force(record: IndentationRecord, unseen: Mask) -> None:
+    force = record.force_uN[~unseen]
+    if np.ptp(force) == 0.0:
+        raise DataError(
+            f"the force is constant, {force[0]:.6g} µN",
+            remedy="check that the sensor is connected, in range and read during the indentation",
+        )
     full = saturated(record)
     if np.mean(full) > _USABLE_SHARE:
         raise SaturatedData(
@@ -163,13 +171,13 @@ def _check_force(record: IndentationRecord, unseen: Mask) -> None:
             f"{len(full)} samples",
             remedy="indent less deep, or use a sensor with a wider range",
         )
-    force = record.force_uN[~unseen]
-    if np.ptp(force) == 0.0:
+    observed, noise = white_sigma(force), _noise(record.force_sigma_uN, force)
+    low, high = (share * observed for share in _STATED_OVER_OBSERVED_NOISE)
+    if low < record.force_sigma_uN < high:
         raise DataError(
-            f"the force is constant, {force[0]:.6g} µN",
-            remedy="check that the sensor is connected, in range and read during the indentation",
+            f"implausible units: the force has noise of {observed:.3g} µN, stated is {record.force_sigma_uN:.3g} µN",
+            remedy=_UNITS,
         )
-    noise = _noise(record.force_sigma_uN, force)
     # Medians of five: a single outlier is no contact.
     smooth = np.median(np.lib.stride_tricks.sliding_window_view(force, 5), axis=1)
     if np.ptp(smooth) < CLEAR * noise:
@@ -199,23 +207,18 @@ def _check_units(record: IndentationRecord, unseen: Mask) -> None:
             remedy="check that the camera follows the contact point, and that deformation_um is in µm",
         )
     largest = float(np.max(np.abs(force)))
-    stiffness_Pa = float(np.ptp(force)) / depth**2 * _PA_PER_UN_UM2
-    remedy = "give time_s in s, deformation in µm and force in µN (1 mN is 1000 µN)"
+    # Of the way, only where it presses: a tip may come from far.
+    pressed = deformation[force - force[0] > _PRESSES * np.ptp(force)]
+    depth = float(np.ptp(pressed)) if len(pressed) > 1 else depth
+    stiffness_Pa = float(np.ptp(force)) / max(depth, 1e-9) ** 2 * _PA_PER_UN_UM2
     if not _SOFTEST_PA <= stiffness_Pa <= _HARDEST_PA:
         raise DataError(
             f"implausible units: {np.ptp(force):.4g} µN at {depth:.4g} µm is a modulus (force over depth squared) of "
             f"{stiffness_Pa:.3g} Pa; soft matter has {_SOFTEST_PA:g} Pa to {_HARDEST_PA:g} Pa",
-            remedy=remedy,
+            remedy=_UNITS,
         )
     if largest > _LARGEST_FORCE_UN:
-        raise DataError(f"implausible units: a force of {largest:.4g} µN", remedy=remedy)
-    observed = white_sigma(record.force_uN)
-    low, high = (share * observed for share in _STATED_OVER_OBSERVED_NOISE)
-    if low < record.force_sigma_uN < high:
-        raise DataError(
-            f"implausible units: the force has noise of {observed:.3g} µN, stated is {record.force_sigma_uN:.3g} µN",
-            remedy=remedy,
-        )
+        raise DataError(f"implausible units: a force of {largest:.4g} µN", remedy=_UNITS)
 
 
 def _noise(stated: float, values: Array) -> float:

@@ -15,7 +15,7 @@ from microdrivers.core.units import NS_PER_S, Range, check_range
 from microdrivers.estimators.vision.contact_patch import ContactPatch
 from microdrivers.estimators.vision.moving_tip import TipView
 from microdrivers.estimators.vision.patch import Patch, PatchMatch
-from microdrivers.estimators.vision.patch_location import MIN_CORRELATION, locate
+from microdrivers.estimators.vision.patch_location import MIN_CORRELATION, locate, locate_along
 from microdrivers.estimators.vision.points import require_grey
 from microdrivers.estimators.vision.template import FloatArray
 from microdrivers.estimators.vision.visual_contact import ContactEvent, VisualContact
@@ -23,6 +23,7 @@ from microdrivers.estimators.vision.visual_contact import ContactEvent, VisualCo
 _NAN = float("nan")
 _SLACK_PX = 4.0
 _PREDICTION_S = 0.5
+_WAY_PX = 60.0
 _UNRIGID_SHARE = 0.01
 _UNRIGID_SIGMAS = 4.0
 
@@ -122,10 +123,9 @@ class DeformationTracker:
         self._camera = camera
         self._scale = ImageScale.from_travel(tip) if scale is None else scale
         self._row = np.array(self._scale.um_per_px)
-        speed_px_s = max_speed_um_s * self._scale.px_per_um
-        limits = {"max_speed_px_s": speed_px_s, "min_correlation": min_correlation}
-        self._tip = _Target(tip.patch, patch.tip_shift, **limits)
-        self._point = _Target(patch.patch, np.zeros(2), **limits)
+        limits = _Limits(max_speed_um_s * self._scale.px_per_um, min_correlation)
+        self._tip = _Target(tip.patch, patch.tip_shift, limits, way=tip.direction)
+        self._point = _Target(patch.patch, np.zeros(2), limits)
         self._contact_px = patch.contact_px
         self._zero_um = 0.0
         self._tip_zero_um = float(self._row @ patch.tip_shift) + patch.gap_px / self._scale.px_per_um
@@ -220,16 +220,21 @@ _REASONS = {
 }
 
 
-class _Target:
-    """One patch on its way through the frames."""
+class _Limits(NamedTuple):
+    max_speed_px_s: float
+    min_correlation: float
 
-    def __init__(self, patch: Patch, shift: FloatArray, *, max_speed_px_s: float, min_correlation: float) -> None:
+
+class _Target:
+    """One patch on its way through the frames; along `way`, a unit vector, if it moves on a line."""
+
+    def __init__(self, patch: Patch, shift: FloatArray, limits: _Limits, *, way: FloatArray | None = None) -> None:
         self._patch = patch
+        self._way = way
         self._shift = shift
         self._t_ns: int | None = None
         self._speed = np.zeros(2)
-        self._max_speed_px_s = max_speed_px_s
-        self._min_correlation = min_correlation
+        self._limits = limits
         self.reason = ""
 
     def follow(self, image: npt.NDArray[Any], t_ns: int) -> PatchMatch | None:
@@ -238,9 +243,9 @@ class _Target:
         # Before the first frame it may have come any way.
         radius_px = float(max(image.shape))
         if self._t_ns is not None:
-            radius_px = min(radius_px, _SLACK_PX + self._max_speed_px_s * elapsed_s)
+            radius_px = min(radius_px, _SLACK_PX + self._limits.max_speed_px_s * elapsed_s)
         expected = self._shift + self._speed * elapsed_s if elapsed_s < _PREDICTION_S else self._shift
-        match = locate(self._patch, image, expected, radius_px=radius_px, min_correlation=self._min_correlation)
+        match = self._locate(image, expected, radius_px)
         if match is None or np.abs(match.shift - self._shift).max() > radius_px:
             self.reason = "MISMATCH" if self._patch.fits_in(image.shape, expected) else "OUT_OF_VIEW"
             return None
@@ -249,3 +254,21 @@ class _Target:
         self._shift, self._t_ns = match.shift, t_ns
         self.reason = ""
         return match
+
+    def _locate(self, image: npt.NDArray[Any], expected: FloatArray, radius_px: float) -> PatchMatch | None:
+        if self._way is None:
+            return locate(
+                self._patch, image, expected, radius_px=radius_px, min_correlation=self._limits.min_correlation
+            )
+        match = self._patch.refine(image, expected)
+        if match is not None and match.correlation >= self._limits.min_correlation:
+            return match
+        # A search by brightness alone would take what lies ahead of the tip for a part of it.
+        reach_px = min(radius_px, _WAY_PX)
+        near = locate_along(
+            self._patch, image, self._way, start=self._shift, back_px=reach_px, ahead_px=reach_px,
+            min_correlation=self._limits.min_correlation,
+        )  # fmt: skip
+        return near or locate(
+            self._patch, image, expected, radius_px=radius_px, min_correlation=self._limits.min_correlation
+        )

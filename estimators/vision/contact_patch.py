@@ -152,7 +152,7 @@ def contact_patch(
 def _find_tip(tip: TipView, image: npt.NDArray[Any], search_um: float) -> PatchMatch | None:
     """On its way first: there it is found even if the specimen lies at its front."""
     reach_px = search_um * tip.scale_px_per_um
-    on_way = locate_along(tip.patch, image, tip.direction, back_px=0.5 * reach_px, ahead_px=reach_px)
+    on_way = locate_along(tip.patch, image, tip.direction, start=np.zeros(2), back_px=0.5 * reach_px, ahead_px=reach_px)
     return on_way or locate(tip.patch, image, np.zeros(2), radius_px=float(max(image.shape)))
 
 

@@ -143,7 +143,11 @@ def _choose_patch(
     plain = take_patch(image, behind, noise_levels=noise_levels, noise_share=noise_share)
     if plain is not None and plain.sigma_px(noise_levels, direction) < _SUFFICIENT_PX:
         return plain
-    return _require_patch(take_patch(image, mask, noise_levels=noise_levels, noise_share=noise_share, nuisance=front.ahead(direction, mask.shape)))
+    return _require_patch(
+        take_patch(
+            image, mask, noise_levels=noise_levels, noise_share=noise_share, nuisance=front.ahead(direction, mask.shape)
+        )
+    )
 
 
 def _check(frames: Sequence[Frame], travel: FloatArray, scale_hint: float) -> float:

@@ -7,7 +7,6 @@ projected on the patch, its two derivatives and a constant; the projection is co
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -75,7 +74,7 @@ class Patch:
         pivot_px: FloatArray,
         noise_levels: float,
         noise_share: float,
-        nuisance: Sequence[FloatArray],
+        nuisance: FloatArray | None,
     ) -> None:
         (u, v), (height, width) = corner, mask.shape
         self._corner = np.array(corner, dtype=np.float64)
@@ -87,12 +86,11 @@ class Patch:
         self._noise_share = noise_share
         rows = _model_rows(image, mask, self._corner, nuisance)
         self._rows = rows
-        self._parts = 4 + len(nuisance)
         self._products = rows @ rows.T
         self._normal = _without_noise(self._products, noise_share * noise_levels**2, self.pixels)
         self._inverse = _inverse(self._normal[:4, :4])
         self._spread = self._inverse[:2, :2]
-        self._score_inverse = _inverse(self._normal[: self._parts, : self._parts])
+        self._score_inverse = _inverse(self._normal[:5, :5])
         stretched = np.vstack([rows[:4], _stretch_rows(rows[:2], mask, pivot_px - self._corner)])
         full_products = stretched @ stretched.T
         full_products[:4, :4] = self._normal[:4, :4]
@@ -144,7 +142,7 @@ class Patch:
 
     def refine(self, image: npt.NDArray[Any], shift: FloatArray) -> PatchMatch | None:
         """Fit shift, gain and bias from `shift` on; None if the fit runs away or leaves the image."""
-        start, extra = shift, np.zeros(self._parts - 4)
+        start, extra = shift, 0.0
         for _ in range(_MAX_ITERATIONS):
             if not np.abs(shift - start).max() < _MAX_REFINEMENT_PX or not self.fits_in(image.shape, shift):
                 return None
@@ -158,15 +156,15 @@ class Patch:
             shift = shift - step
             if np.abs(step).max() < _CONVERGED_PX:
                 return self._judge(sampled, products, fitted @ mixture, inverse[:2, :2], shift, part)
-            extra = fitted[4:] / fitted[2]
+            extra = float(fitted[4] / fitted[2]) if len(fitted) > 4 else 0.0
         return None
 
-    def _model(self, extra: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How the rows combine while `extra` of the nuisances lies on the patch, and the inverse normal matrix."""
-        if not len(extra):
+    def _model(self, extra: float) -> tuple[FloatArray, FloatArray]:
+        """How the rows combine while `extra` of the nuisance lies on the patch, and the inverse normal matrix."""
+        if len(self._rows) == 4:
             return _PLAIN, self._inverse
-        mixture = np.eye(self._parts, len(self._rows))
-        mixture[0, self._parts :: 2] = mixture[1, self._parts + 1 :: 2] = extra
+        mixture = np.eye(5, 7)
+        mixture[0, 5] = mixture[1, 6] = extra
         return mixture, _inverse(mixture @ self._normal @ mixture.T)
 
     def _sample(self, image: npt.NDArray[Any], shift: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -221,7 +219,7 @@ def take_patch(
     noise_levels: float,
     noise_share: float,
     pivot_px: FloatArray | None = None,
-    nuisance: Sequence[FloatArray] = (),
+    nuisance: FloatArray | None = None,
 ) -> Patch | None:
     """The patch of `image` under `mask`, or None if it is too small, at the border, or does not fix both axes.
 
@@ -231,7 +229,7 @@ def take_patch(
         noise_levels: standard deviation of the noise of the frames to come.
         noise_share: variance of the noise in `image` over that of the frames to come: 1/n for a mean of n frames.
         pivot_px: the point (u, v) whose shift is wanted, for `PatchMatch.unrigid`; the middle of the patch if None.
-        nuisance: images, as large as this one, of which any multiple may come on top of the patch.
+        nuisance: levels, as large as the image, of which any multiple may come on top of the patch.
     """
     v, u = np.nonzero(mask)
     if len(u) < MIN_PIXELS:
@@ -240,8 +238,8 @@ def take_patch(
     if min(low) < MARGIN_PX or high[0] > image.shape[1] - MARGIN_PX or high[1] > image.shape[0] - MARGIN_PX:
         return None
     window = (slice(low[1], high[1]), slice(low[0], high[0]))
-    cut = [levels[window] for levels in nuisance]
-    rows = _model_rows(image, mask[window], np.array(low, dtype=np.float64), cut)[: 4 + len(cut)]
+    cut = None if nuisance is None else nuisance[window]
+    rows = _model_rows(image, mask[window], np.array(low, dtype=np.float64), cut)[:5]
     if not _independent(_without_noise(rows @ rows.T, noise_share * noise_levels**2, len(u))):
         return None
     pivot = np.array([u.mean(), v.mean()]) if pivot_px is None else pivot_px
@@ -263,18 +261,17 @@ def _correlation(sampled: FloatArray, explained: float) -> float:
     return math.sqrt(min(1.0, max(0.0, (explained - mean_part) / total))) if total > 0.0 else 0.0
 
 
-def _model_rows(image: Float32Array, mask: BoolArray, corner: FloatArray, nuisance: Sequence[FloatArray]) -> FloatArray:
+def _model_rows(image: Float32Array, mask: BoolArray, corner: FloatArray, nuisance: FloatArray | None) -> FloatArray:
     """What an image of the patch is made of.
 
-    Both derivatives, the patch itself, a constant; then the nuisances, and both derivatives of each.
+    Both derivatives, the patch itself, a constant; if there is a nuisance, it and both its derivatives.
     """
     (u, v), (height, width) = corner.astype(int).tolist(), mask.shape
     framed = image[v - 2 : v + height + 2, u - 2 : u + width + 2].astype(np.float64)
     patch = framed[2:-2, 2:-2]
     parts = [*_derivatives(framed), patch - patch[mask].mean(), np.ones_like(patch)]
-    parts += nuisance
-    for levels in nuisance:
-        parts += _derivatives(np.pad(levels, 2, mode="edge"))
+    if nuisance is not None:
+        parts += [nuisance, *_derivatives(np.pad(nuisance, 2, mode="edge"))]
     return np.stack([part[mask] for part in parts])
 
 

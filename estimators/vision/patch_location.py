@@ -14,6 +14,7 @@ MIN_CORRELATION = 0.75
 """Below it, what was found is something else."""
 
 _CANDIDATES = 5
+_STEP_PX = 1.5
 
 
 def locate(
@@ -38,12 +39,13 @@ def locate_along(
     image: npt.NDArray[Any],
     direction: FloatArray,
     *,
+    start: FloatArray,
     back_px: float,
     ahead_px: float,
     min_correlation: float = MIN_CORRELATION,
 ) -> PatchMatch | None:
-    """Find `patch` on a line through where it was taken, whatever lies ahead of it; None if it is not there."""
-    shifts = [step * direction for step in np.arange(-back_px, ahead_px + 1.0)]
+    """Find `patch` on a line through the shift `start`, whatever lies ahead of it; None if it is not there."""
+    shifts = [start + step * direction for step in np.arange(-back_px, ahead_px + _STEP_PX, _STEP_PX)]
     scores = np.array([patch.score(image, shift) for shift in shifts])
     matches = [patch.refine(image, shifts[k]) for k in np.argsort(scores)[-_CANDIDATES:].tolist()]
     found = [match for match in matches if match is not None and match.correlation >= min_correlation]

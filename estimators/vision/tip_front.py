@@ -35,11 +35,10 @@ class TipFront(NamedTuple):
         v, u = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
         return np.asarray((u - self.point[0]) * direction[0] + (v - self.point[1]) * direction[1])
 
-    def ahead(self, direction: FloatArray, shape: tuple[int, ...]) -> list[FloatArray]:
-        """What other brightnesses ahead of the tip add to its image: when it arrives, the specimen is there."""
-        along = self.along(direction, shape)
-        level = np.interp(along, np.arange(-FLANK_PX[1], FLANK_PX[1] + 1.0), self.profile)
-        return [level, level * along]
+    def ahead(self, direction: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+        """What another brightness ahead of the tip adds to its image: when it arrives, the specimen is there."""
+        steps = np.arange(-FLANK_PX[1], FLANK_PX[1] + 1.0)
+        return np.asarray(np.interp(self.along(direction, shape), steps, self.profile))
 
 
 def find_front(image: Float32Array, region: BoolArray, direction: FloatArray) -> TipFront:

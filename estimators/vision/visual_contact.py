@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,8 @@ _REST_GAP = 5
 _RISEN_SIGMAS = 5.0
 _BEGUN = 0.3
 _TOGETHER = 0.4
-_TOGETHER_SIGMAS = 4.0
+_LONGEST = 60
+_TOGETHER_SIGMAS = 3.0
 _MOVING_SIGMAS = 3.0
 _ROUNDS = 20
 
@@ -102,11 +103,34 @@ class VisualContact:
         self._risen = self._risen + 1 if risen > _RISEN_SIGMAS else 0
         if self._sum < self._threshold or self._risen < self._confirm_frames or risen < self._confirm_sigmas:
             return None
-        self.event = self._place(rest, rest_sigma)
-        if self.event is None:
+        verdict = self._moves_along(rest)
+        if verdict == "undecided":
+            return None
+        if verdict == "otherwise":
             self._samples.clear()
             self._sum, self._moving, self._risen = 0.0, 0, 0
+            return None
+        self.event = self._place(rest, rest_sigma)
         return self.event
+
+    def _moves_along(self, rest: float) -> Literal["along", "otherwise", "undecided"]:
+        """Whether the specimen has moved as the tip has since the sum left zero."""
+        recent = self._recent()
+        first, last = self._samples[-1 - self._moving], recent[-1]
+        risen = last.deformation_um - rest
+        begun = next(sample for sample in recent if sample.deformation_um - rest > _BEGUN * risen)
+        further = last.deformation_um - begun.deformation_um
+        allowance = _TOGETHER_SIGMAS * math.sqrt(2.0) * math.hypot(last.sigma_um, last.tip_sigma_um)
+        if abs(further) < allowance / _TOGETHER and self._moving < _LONGEST:
+            return "undecided"
+        along = abs(last.tip_um - begun.tip_um - further) < _TOGETHER * abs(further) + allowance
+        # Until the touch the tip may come any way, but not less than the specimen has gone since.
+        came = last.tip_um - first.tip_um > (1.0 - _TOGETHER) * risen - allowance
+        return "along" if along and came else "otherwise"
+
+    def _recent(self) -> list[DeformationSample]:
+        """The samples since the sum left zero."""
+        return [self._samples[k] for k in range(len(self._samples) - self._moving, len(self._samples))]
 
     def _rest(self, resting: int) -> tuple[float, float]:
         """Mean deformation before the newest rise, and its standard deviation."""
@@ -115,21 +139,13 @@ class VisualContact:
         sigmas = np.array([self._samples[k].sigma_um for k in range(count)])
         return float(values.mean()), float(np.sqrt(np.mean(sigmas**2) / count))
 
-    def _place(self, rest: float, rest_sigma: float) -> ContactEvent | None:
-        """The touch from the frames around it, or None if tip and specimen do not move as one."""
-        recent = [self._samples[k] for k in range(len(self._samples) - self._moving, len(self._samples))]
+    def _place(self, rest: float, rest_sigma: float) -> ContactEvent:
+        """The touch: where deformation = max(0, tip − place) fits best."""
+        recent = self._recent()
         tip = np.array([sample.tip_um for sample in recent])
         deformation = np.array([sample.deformation_um for sample in recent]) - rest
         variance = np.array([sample.sigma_um**2 + sample.tip_sigma_um**2 for sample in recent])
-        allowance = _TOGETHER_SIGMAS * math.sqrt(2.0 * float(variance[-1]))
-        came = float(tip[-1]) - self._samples[-1 - self._moving].tip_um
-        if came < (1.0 - _TOGETHER) * deformation[-1] - allowance:
-            return None
-        begun = int(np.argmax(deformation > _BEGUN * deformation[-1]))
-        further = float(deformation[-1] - deformation[begun])
-        if abs(float(tip[-1] - tip[begun]) - further) > _TOGETHER * abs(further) + allowance:
-            return None
-        place = float((tip - deformation)[begun:].mean())
+        place = float((tip - deformation)[deformation > _BEGUN * deformation[-1]].mean())
         after = tip > place
         for _ in range(_ROUNDS):
             weights = after / variance

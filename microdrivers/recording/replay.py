@@ -90,9 +90,7 @@ class Replay:
         members = set(ordered)
         early: dict[int, tuple[str, Sample]] = {}
         for wanted in ordered:
-            while wanted not in early and self._fill():
-                if order is not None and self._waiting[0][0] >= order:
-                    break
+            while wanted not in early and self._fill() and self._waiting[0][0] <= wanted:
                 number, _, topic, sample = heapq.heappop(self._waiting)
                 if number in members:
                     early[number] = (topic, sample)

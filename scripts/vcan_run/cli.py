@@ -16,11 +16,13 @@ _DETAILS = """\
 backends:
   native  this kernel: modprobe vcan, ip link add (root or passwordless sudo), if they are not up already
   uml     User Mode Linux: starts in 2-3 s, Python at full speed, system calls slower; CAN only; needs no root.
-          Its clock stands still while the host does not let it run, so a busy host makes it late for nothing; with -s
-          it also jumps over times in which all that runs there waits, so they pass at once
   qemu    emulated PC: starts in about 10 s, Python 20-30 times slower; also /dev/video0 (vivid) and two 16550A
           UARTs wired to each other, /dev/ttyS1 and /dev/ttyS2; as root, the guest can read what root can
   auto    the first of native, uml, qemu that can run here (default)
+
+virtual time (-s), in which nothing is late because the host is busy or the guest slow:
+  uml     what the guest waits for comes at once. Even without -s its clock stands still while it is not let run
+  qemu    the clock counts instructions, 1 ns each; twice as slow. Not with KVM
 
 further kernel modules (-k) that are of use with qemu:
   kvaser_pci                             can0 and can1, SJA1000 controllers on one bus (set the bitrate, then up)
@@ -46,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("-t", "--limit", type=_positive, default=900, metavar="SECONDS", help="time limit (900)")
     parser.add_argument("-m", "--memory", type=_positive, default=1024, metavar="MIB", help="of a guest (1024)")
     parser.add_argument("-k", "--modules", action="append", default=[], help="further kernel modules to load")
-    parser.add_argument("-s", "--skip-idle", action="store_true", help="uml: take no real time for waiting")
+    parser.add_argument("-s", "--virtual-time", action="store_true", help="see below; for guests only")
     parser.add_argument("-v", "--verbose", action="store_true", help="show what the guest's kernel says")
     parser.add_argument(
         "--setup", choices=("auto", "uml", "qemu"),
@@ -76,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             memory_mib=options.memory,
             modules=tuple(name for names in options.modules for name in names.split()),
             show_boot_log=options.verbose,
-            skip_idle=options.skip_idle,
+            virtual_time=options.virtual_time,
         )
         return _run(options.backend, job, cache)
     except NotUsable as error:

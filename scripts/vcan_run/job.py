@@ -11,14 +11,18 @@ GUEST_FAILED = 125
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A command and the limits and surroundings that it gets; `skip_idle` is for User Mode Linux (`uml_clock.c`)."""
+    """A command and the limits and surroundings that it gets.
+
+    Attributes:
+        virtual_time: a guest's clock counts what is done there and what is waited for, not the time that this takes.
+    """
 
     command: tuple[str, ...]
     limit_s: int
     memory_mib: int
     modules: tuple[str, ...]
     show_boot_log: bool
-    skip_idle: bool
+    virtual_time: bool
 
 
 class NotUsable(Exception):

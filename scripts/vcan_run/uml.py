@@ -38,7 +38,7 @@ def run(job: Job, cache: Cache) -> int:
             f"uml_dir={session.folder}", "umid=u",
         ]  # fmt: skip
         environment = {"TMPDIR": str(_memory_folder(job, session)), "LD_PRELOAD": str(cache.uml_preload)}
-        if job.skip_idle:
+        if job.virtual_time:
             environment["VCAN_RUN_SKIP_IDLE"] = "1"
         os.sched_setaffinity(0, {_idlest_processor()})
         return session.run(machine, environment)

@@ -6,6 +6,7 @@ Nothing here asserts how fast anything is; scripts/bench_wires measures that.
 import random
 import subprocess
 import sys
+from contextlib import ExitStack
 from typing import NamedTuple
 
 import msgspec
@@ -17,9 +18,12 @@ from microdrivers.core.samples import Frame, OpticsEstimate, XYThetaSample, Zoom
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.estimators.optics import student_factor
 from microdrivers.estimators.optics.calibrator import OpticsCalibrator
+from microdrivers.recording.header import describe_recording
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.recorder import Recorder
 from microdrivers.results.optics import OpticsResult
 from microdrivers.rig import open_rig
-from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsRun, calibrate_optics
+from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsReplay, OpticsRun, calibrate_optics
 from microdrivers.routines.optics.calibration import build_result
 from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.provenance import describe_run
@@ -63,10 +67,19 @@ def served_rig(tmp_path_factory, world):
             serving.terminate()
 
 
-def calibrated(file, clock, *, fake=False, world=None, **settings):
-    with open_rig(file, clock=clock, fake=fake, seed=SEED, world=world) as rig:
+def calibrated(file, clock, *, fake=False, world=None, recording=None, **settings):
+    with open_rig(file, clock=clock, fake=fake, seed=SEED, world=world) as rig, ExitStack() as stack:
         source = CircleExperiment(rig, CircleSettings(**settings))
-        run = calibrate_optics(source, keep_samples=True)
+        recorder = None
+        if recording is not None:
+            header = describe_recording(source="fake")
+            recorder = stack.enter_context(Recorder(recording, bus=rig.bus, clock=clock, header=header))
+
+        def follow(host, inbox):
+            if recorder is not None:
+                recorder.follow_arrivals(host, inbox.arrivals)
+
+        run = calibrate_optics(source, keep_samples=True, on_host=follow)
     known = {"source": "test", "clock": "simulated" if clock.simulated else "system", "rig_name": "workstation"}
     result = build_result(run, describe_run(known, command="test", now=utc_now()))
     return Calibration(run, result, source.frames_expected())
@@ -87,8 +100,9 @@ def replayed(calibration, samples):
     return [result for result in results if isinstance(result, OpticsEstimate)]
 
 
-def test_a_threaded_run_on_ports_replays_in_the_order_of_its_inbox_to_the_same_bits(served_rig):
-    calibration = calibrated(served_rig, SystemClock(), settled=False, frames=40, change_after_frame=20)
+def test_a_threaded_run_on_ports_replays_in_the_order_of_its_inbox_to_the_same_bits(served_rig, tmp_path):
+    file = tmp_path / "run.mcap"
+    calibration = calibrated(served_rig, SystemClock(), recording=file, settled=False, frames=40, change_after_frame=20)
     run = calibration.run
     assert run.complete
     assert [sample.order for sample in run.recorded] == run.arrivals
@@ -98,6 +112,10 @@ def test_a_threaded_run_on_ports_replays_in_the_order_of_its_inbox_to_the_same_b
 
     shuffled = random.Random(1).sample(run.recorded, len(run.recorded))
     assert bits(replayed(calibration, shuffled)) == bits(run.estimates)
+    with Recording(file) as recording:
+        again = calibrate_optics(OpticsReplay(recording))
+    assert again.arrivals == run.arrivals
+    assert bits(again.estimates) == bits(run.estimates)
 
 
 def test_a_calibration_on_ports_agrees_with_one_in_process_of_the_same_world(served_rig, world):

@@ -21,7 +21,7 @@ GUEST = Path(__file__).parents[2] / "scripts" / "vcan_run" / "guest"
 
 def job(*command, limit_s=30, modules=()):
     return Job(
-        command=command, limit_s=limit_s, memory_mib=64, modules=modules, show_boot_log=False, skip_idle=False
+        command=command, limit_s=limit_s, memory_mib=64, modules=modules, show_boot_log=False, virtual_time=False
     )  # fmt: skip
 
 

@@ -16,14 +16,14 @@ def test_the_tail_is_a_probability_at_the_ends():
     assert 0.0 <= chi_square_tail(1e6, 40) < 1e-300
 
 
-def tested(residual, noise=1.0):
+def outcome_of(residual, noise=1.0):
     place = np.arange(len(residual))
     return structure_test([residual, residual[::-1]], place, residual * noise, np.full(len(residual), noise))
 
 
 def test_white_noise_is_hardly_ever_a_misfit():
     rng = np.random.default_rng(0)
-    found = [tested(rng.standard_normal(900)) for _ in range(200)]
+    found = [outcome_of(rng.standard_normal(900)) for _ in range(200)]
     # The two series are one and its mirror image: p-values are not uniform, but no misfit may be found.
     assert not any(test.found for test in found)
     assert "looks like noise" in found[0].text
@@ -38,7 +38,7 @@ def test_the_p_value_of_independent_noise_is_uniform():
 
 def test_a_slow_residual_is_a_misfit():
     slow = 2.0 * np.sin(np.arange(900) / 40.0)
-    found = tested(slow + np.random.default_rng(2).standard_normal(900), noise=0.4)
+    found = outcome_of(slow + np.random.default_rng(2).standard_normal(900), noise=0.4)
     assert found.found
     assert found.structured_uN == pytest.approx(0.4 * 2.0 / np.sqrt(2.0), rel=0.1)
     assert found.p_value < 1e-6
@@ -47,7 +47,7 @@ def test_a_slow_residual_is_a_misfit():
 
 def test_structure_far_below_the_noise_is_said_but_is_no_misfit():
     slow = 0.3 * np.sin(np.arange(4000) / 40.0)
-    found = tested(slow + np.random.default_rng(3).standard_normal(4000))
+    found = outcome_of(slow + np.random.default_rng(3).standard_normal(4000))
     assert found.p_value < 0.01
     assert not found.found
     assert "less than the noise" in found.text

@@ -1,0 +1,202 @@
+"""What a routine has recorded gives the same bits again, and says what is missing."""
+
+import msgspec
+import pytest
+
+from microdrivers.configs import shipped_rig
+from microdrivers.core.bus import Bus
+from microdrivers.core.clock import SimulatedClock, utc_now
+from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.samples import Frame, XYThetaSample
+from microdrivers.recording.header import describe_recording
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.recorder import Recorder
+from microdrivers.recording.replay import Replay
+from microdrivers.rig import open_rig
+from microdrivers.routines.force import (
+    Characterisation,
+    IndentationReplay,
+    PressExperiment,
+    PressSettings,
+    build_result,
+)
+from microdrivers.routines.force.source import READY
+from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsReplay, calibrate_optics
+from microdrivers.routines.provenance import describe_run
+
+
+def bits(estimates):
+    return [msgspec.msgpack.encode(msgspec.structs.replace(estimate, order=-1)) for estimate in estimates]
+
+
+def recorder_of(file, rig, **options):
+    return Recorder(file, bus=rig.bus, clock=rig.clock, header=describe_recording(source="fake", seed=2), **options)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A simulated calibration through a zoom change, and its recording."""
+    file = tmp_path_factory.mktemp("recorded") / "run.mcap"
+    with (
+        open_rig(shipped_rig("microscope"), fake=True, seed=2, clock=SimulatedClock()) as rig,
+        recorder_of(file, rig) as recorder,
+    ):
+        source = CircleExperiment(rig, CircleSettings(frames=60, change_after_frame=30))
+        run = calibrate_optics(source, on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals))
+    return run, file
+
+
+def test_a_recorded_calibration_gives_the_same_bits(calibrated):
+    run, file = calibrated
+    with Recording(file) as recording:
+        again = calibrate_optics(OpticsReplay(recording))
+    assert bits(again.estimates) == bits(run.estimates)
+    assert again.arrivals == run.arrivals
+    assert again.optics == run.optics
+
+
+def test_the_estimator_sees_what_it_saw(calibrated):
+    run, file = calibrated
+    with Recording(file) as recording:
+        assert list(recording.arrivals["optics"]) == run.arrivals
+        again = calibrate_optics(OpticsReplay(recording), keep_samples=True)
+    assert [sample.order for sample in again.recorded] == run.arrivals
+
+
+def test_a_recording_without_a_calibration_is_refused(tmp_path):
+    clock, bus = SimulatedClock(), Bus()
+    with Recorder(tmp_path / "a.mcap", bus=bus, clock=clock, header=describe_recording(source="fake")):
+        bus.topic("stage", XYThetaSample)
+    for source in (OpticsReplay, IndentationReplay):
+        with Recording(tmp_path / "a.mcap") as recording, pytest.raises(UnsupportedError, match="holds no"):
+            source(recording)
+
+
+def test_a_recording_that_lacks_the_frames_says_so(tmp_path):
+    file = tmp_path / "run.mcap"
+    with (
+        open_rig(shipped_rig("microscope"), fake=True, seed=2, clock=SimulatedClock()) as rig,
+        recorder_of(file, rig, topics=("routine", "sample_stage", "zoom")),
+    ):
+        calibrate_optics(CircleExperiment(rig, CircleSettings(frames=10, zoom_to=0.9)))
+    with Recording(file) as recording, pytest.raises(UnsupportedError, match="lacks the frame"):
+        calibrate_optics(OpticsReplay(recording))
+
+
+def poses(file, orders, *, arrivals=()):
+    """A recording of poses with these orders, in this order of the file."""
+    clock, bus = SimulatedClock(), Bus()
+    with Recorder(file, bus=bus, clock=clock, header=describe_recording(source="fake")) as recorder:
+        for order in orders:
+            bus.topic("stage", XYThetaSample).publish(
+                XYThetaSample(
+                    t_ns=1000 * order, device="stage", order=order, x_um=float(order), y_um=0.0, theta_deg=0.0,
+                    moving=False, on_target=True, referenced=True,
+                )
+            )  # fmt: skip
+        recorder.note_arrivals("host", arrivals)
+    return Recording(file)
+
+
+def published(recording, play):
+    bus, seen = Bus(), []
+    bus.topic("stage", XYThetaSample).subscribe(lambda sample: seen.append(sample.order))
+    replay = Replay(recording, bus)
+    play(replay)
+    return seen, replay
+
+
+def test_samples_come_in_the_order_of_the_bus(tmp_path):
+    seen, _ = published(poses(tmp_path / "a.mcap", [0, 2, 1, 4, 3, 5]), lambda replay: replay.up_to(None))
+    assert seen == [0, 1, 2, 3, 4, 5]
+
+
+def test_those_of_an_inbox_come_as_they_arrived_there(tmp_path):
+    recording = poses(tmp_path / "a.mcap", range(8), arrivals=[1, 4, 2, 6])
+
+    def play(replay):
+        replay.up_to(1)
+        replay.as_arrived("host", 7)
+
+    seen, replay = published(recording, play)
+    assert [order for order in seen if order in (1, 4, 2, 6)] == [1, 4, 2, 6]
+    assert sorted(seen) == [0, 1, 2, 3, 4, 5, 6]
+    assert replay.missing == 0
+
+
+def test_what_an_inbox_had_and_the_file_has_not_is_counted(tmp_path):
+    recording = poses(tmp_path / "a.mcap", [0, 1, 3, 4], arrivals=[0, 1, 2, 3])
+    seen, replay = published(recording, lambda replay: replay.as_arrived("host", None))
+    assert seen == [0, 1, 3, 4]
+    assert replay.missing == 1
+
+
+def test_the_pace_is_that_of_the_times(tmp_path):
+    recording = poses(tmp_path / "a.mcap", [0, 1_000_000, 3_000_000])
+    clock, bus = SimulatedClock(), Bus()
+    times = []
+    bus.topic("stage", XYThetaSample).subscribe(lambda _sample: times.append(clock.now_ns()))
+    Replay(recording, bus, clock=clock, speed=2.0).up_to(None)
+    assert [t - times[0] for t in times] == [0, 500_000_000, 1_500_000_000]
+
+
+@pytest.fixture(scope="module")
+def indented(tmp_path_factory):
+    """A short simulated characterisation with a fresh indentation, and its recording."""
+    file = tmp_path_factory.mktemp("recorded") / "run.mcap"
+    rig_file = small_rig(tmp_path_factory.mktemp("rig"))
+    overrides = {"specimen": {"preset": "slip_corrected"}}
+    with (
+        open_rig(
+            rig_file, fake=True, seed=2, clock=SimulatedClock(), devices="probe", world_overrides=overrides
+        ) as rig,
+        recorder_of(file, rig) as recorder,
+    ):
+        source = PressExperiment(rig, PressSettings(speed_um_s=20.0, depth_um=30.0, rest_s=0.5))
+        characterisation = Characterisation(
+            source, on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals)
+        )
+        run = characterisation.run()
+    return run, file
+
+
+def small_rig(folder):
+    """The workstation with a camera that sees the middle of the view alone, and slower force readings."""
+    text = shipped_rig().read_text()
+    section = text.index("  camera_fine:")
+    text = text[:section] + text[section:].replace("[640, 480]", "[320, 240]", 1)
+    section = text.index("  probe_force:")
+    text = text[:section] + text[section:].replace("rate_hz: 1000", "rate_hz: 200", 1)
+    file = folder / "workstation.yaml"
+    file.write_text(text)
+    return file
+
+
+def test_a_recorded_characterisation_gives_the_same_bits(indented):
+    run, file = indented
+    with Recording(file) as recording:
+        again = Characterisation(IndentationReplay(recording)).run()
+    for before, after in ((run.first, again.first), (run.check, again.check)):
+        assert bits(after.samples) == bits(before.samples)
+        assert bits(after.deformations) == bits(before.deformations)
+        assert bits(after.estimates) == bits(before.estimates)
+        assert bits(after.forces) == bits(before.forces)
+        assert after.arrivals == before.arrivals
+    provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
+    assert build_result(again, provenance) == build_result(run, provenance)
+
+
+def test_the_experiment_notes_what_its_replay_needs(indented):
+    _, file = indented
+    with Recording(file) as recording:
+        kinds = [sample.kind for _, sample in recording.samples(("routine",))]
+        frames = sum(isinstance(sample, Frame) for _, sample in recording.samples(("camera_fine",)))
+    assert kinds == [READY, "force/begin", "force/end", "force/begin", "force/end"]
+    assert frames > 100
+
+
+def test_the_specimen_was_identified(indented):
+    run, _ = indented
+    fit = run.identification.protocols["slip_corrected"]
+    assert fit.k1_uN_per_um == pytest.approx(5.8781, rel=0.05)
+    assert run.setup.scale_px_per_um is not None
