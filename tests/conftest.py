@@ -1,6 +1,7 @@
 """The same examples in every run: what a random search finds belongs into a test of its own. And strictness in CI."""
 
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -29,3 +30,57 @@ def pytest_runtest_makereport(item, call):
 def pytest_make_collect_report(collector):
     """A whole module can be skipped as it is imported."""
     return _refuse_skip((yield))
+
+
+@pytest.fixture(scope="session")
+def optics_recording(tmp_path_factory):
+    """A recorded optical calibration of 30 small frames, as `calibrate optics` leaves one."""
+    from microdrivers.core.bus import Bus
+    from microdrivers.core.clock import SimulatedClock
+    from microdrivers.core.samples import Frame
+    from microdrivers.recording.header import RecordingHeader
+    from microdrivers.recording.image_sequence import ImageSequence
+    from microdrivers.recording.recorder import Recorder
+    from microdrivers.routines.notes import note
+    from microdrivers.routines.optics.source import BEGIN
+
+    bus, clock = Bus(), SimulatedClock()
+    known = {
+        "names": {"stage": "stage", "zoom": "zoom", "camera": "camera"}, "target": "texture",
+        "near_px": (0.0, 0.0), "first_frame": 0, "frames_expected": 29,
+        "optics": {
+            "camera": "camera", "binning": 1, "roi": (0, 0, 320, 240), "objective": None, "pixel_pitch_um": None
+        },
+    }  # fmt: skip
+    folder = tmp_path_factory.mktemp("optics")
+    header = RecordingHeader(source="recorded", rig="table", seed=4, created_utc="2026-01-01")
+    with Recorder(folder / "run.mcap", bus=bus, clock=clock, header=header):
+        bus.topic("camera", Frame).subscribe(lambda frame: frame.seq or note(bus, clock, BEGIN, known))
+        sequence = ImageSequence(Path(__file__).parent / "data" / "micrograph_sequence")
+        sequence.publish(bus, stage="stage", zoom="zoom", camera="camera")
+    return folder / "run.mcap"
+
+
+@pytest.fixture(scope="session")
+def force_recording(tmp_path_factory):
+    """A recorded force characterisation without frames."""
+    from microdrivers.core.clock import SimulatedClock
+    from microdrivers.recording.header import RecordingHeader
+    from microdrivers.recording.indentation_table import IndentationTable
+    from microdrivers.recording.recorder import Recorder
+    from microdrivers.routines.force import IndentationPlayback
+    from microdrivers.routines.force.source import BEGIN, END, READY
+    from microdrivers.routines.notes import note
+    from microdrivers.routines.progress import SilentProgress
+
+    clock = SimulatedClock()
+    table = IndentationTable(Path(__file__).parent / "data" / "force" / "chiaro_aebp1_30hz.csv")
+    source = IndentationPlayback(table)
+    folder = tmp_path_factory.mktemp("force")
+    known = {"names": source.names._asdict(), "setup": source.setup()._asdict()}
+    with Recorder(folder / "run.mcap", bus=source.bus, clock=clock, header=RecordingHeader(source="recorded")):
+        note(source.bus, clock, READY, known)
+        note(source.bus, clock, BEGIN, {})
+        source.indent(lambda: None, SilentProgress())
+        note(source.bus, clock, END, {})
+    return folder / "run.mcap"

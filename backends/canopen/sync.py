@@ -180,10 +180,11 @@ class SyncProducer:
                 self._line.wait(self._answered, (patient_until_ns - now_ns) / NS_PER_S)
 
     def _quiet_until_ns(self) -> int:
-        quiet_until_ns = 0
+        latest_ns = 0
         for each in self._answering:
-            quiet_until_ns = max(quiet_until_ns, each.quiet_until_ns)
-        return quiet_until_ns
+            if (own_ns := each.quiet_until_ns) > latest_ns:
+                latest_ns = own_ns
+        return latest_ns
 
     def _beat(self) -> None:
         """One beat of the fastest stream."""

@@ -237,21 +237,20 @@ class SyncedPdos:
             if not self._counting:
                 self._ask_for_quiet(cob_id)
                 return
+            complete: list[_Round] = []
             for current in self._rounds:
                 if cob_id not in current.frames:
+                    if received.t_ns + received.dt_ns < current.pulse.earliest_ns:
+                        return  # it was on the bus before: an answer that counts as lost
+                    current.frames[cob_id] = received
+                    for each in self._rounds:
+                        if len(each.frames) < self._size:
+                            return
+                    complete, self._rounds = self._rounds, []
                     break
-            else:
-                current = None
-            if current is not None:
-                if received.t_ns + received.dt_ns < current.pulse.earliest_ns:
-                    return  # it was on the bus before: an answer that counts as lost
-                current.frames[cob_id] = received
-                for each in self._rounds:
-                    if len(each.frames) < self._size:
-                        return
-            complete, self._rounds = self._rounds, []
-        if current is None:
-            self._discard()  # an answer to no SYNC of ours
+        if not complete:
+            self._discard()  # an answer to no SYNC of ours: what is awaited cannot be told apart either
+            return
         self._producer.answered()
         for each in complete:
             if not each.on_trial:

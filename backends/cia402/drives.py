@@ -51,6 +51,14 @@ class Drives:
         self._timeout_s = timeout_s
         self._check = check
 
+    def are_ready(self) -> bool:
+        """Whether all are set up."""
+        return all(drive.ready for drive in self.all)
+
+    def are_braking(self) -> bool:
+        """Whether one was told to stop, and has not been seen at rest since."""
+        return any(drive.watch.braking for drive in self.all)
+
     # ------------------------------------------------------------------ looking
 
     def look(self) -> SyncSet:

@@ -209,22 +209,21 @@ class Cia402FineStage(FineStage):
         Raises:
             LinkLost: a drive is silent; the others have been set up.
         """
-        drives = self._drives.all
-        if not all(drive.ready for drive in drives):
+        if not self._drives.are_ready():
             with self._line.holding(self._setting_up, timeout_s=_BUSY_S, what="setting up the drives"):
-                for drive in drives:
+                for drive in self._drives.all:
                     if drive.ready or not drive.node.alive:
                         continue
                     with self.clock.transaction():  # on a simulated clock nobody else gets in between
                         set_up(drive, heartbeat_ms=self._settings.heartbeat_ms, clock=self.clock)
                     if drive.referenced and self._guard.on_duty:
                         self._tell("reference_found", f"axis {drive.axis}: the drive still knows it")
-                if all(drive.ready for drive in drives):
+                if self._drives.are_ready():
                     self._drives.pdos.resume()
         self._guard.require_alive()
 
     def _regain_link(self) -> None:
-        if self.link == "lost" and self._guard.on_duty and all(drive.ready for drive in self._drives.all):
+        if self.link == "lost" and self._guard.on_duty and self._drives.are_ready():
             self.link = "open"
             self._tell("link_back", "")
 
@@ -240,11 +239,11 @@ class Cia402FineStage(FineStage):
         try:
             found = self._drives.look()
         except LinkTimeout:
-            if all(drive.ready for drive in self._drives.all):
+            if self._drives.are_ready():
                 raise
             self._be_ready()  # one has restarted meanwhile
             found = self._drives.look()
-        if any(drive.watch.braking for drive in self._drives.all):
+        if self._drives.are_braking():
             rest(self.clock)  # rest shows only in two looks
             found = self._drives.look()
         self._guard.examine()

@@ -18,13 +18,15 @@ _FAULT_FLAGS = frozenset({FAULT_FLAG})
 def pose_sample(
     drives: Sequence[Drive], found: SyncSet, *, targets_um: Mapping[str, float], at_fault: bool, device: str, seq: int
 ) -> FineStageSample:
-    """The pose in µm. A target counts as long as its drive holds it; on target is who holds one, and all that do.
+    """The pose in µm. The stage is on target when an axis holds one and all that hold one are there.
 
     Args:
         drives: of x, y and z, with the readings of this set.
         found: the set: when it was taken.
-        targets_um: by axis, the last that were commanded.
+        targets_um: by axis, the last that were commanded; they count as long as the drives hold them.
         at_fault: whether there is a fault that nobody has cleared.
+        device: the stage.
+        seq: number of the sample.
     """
     places_um, held_um = [], []
     moving, holds, on_target, referenced = False, False, True, True

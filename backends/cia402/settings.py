@@ -100,8 +100,8 @@ class FineStageSettings(DeviceSettings):
 
     `reference_order` is the one order in which axes may be referenced: an axis that takes the tool out of harm's way
     comes first. `axes_in_rig` says how the stage's holder is tilted against the rig, `origin_um` where in the rig's
-    frame the tip of the tool is when all axes are at 0, `retract_um` which way, in the stage's own axes, leads away from
-    the sample.
+    frame the tip of the tool is when all axes are at 0, `retract_um` which way, in the stage's own axes, leads away
+    from the sample.
 
     `heartbeat_ms` is the interval of the drives' heartbeats, and how long they go on without hearing ours before they
     stop. `settle_s` is how long a move may take to settle; `reference_timeout_s` how long one axis may search.

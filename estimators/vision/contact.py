@@ -18,7 +18,7 @@ from microdrivers.estimators.vision.patch import Patch, PatchMatch
 from microdrivers.estimators.vision.patch_location import MIN_CORRELATION, locate, locate_along
 from microdrivers.estimators.vision.points import require_grey
 from microdrivers.estimators.vision.template import FloatArray
-from microdrivers.estimators.vision.visual_contact import ContactEvent, VisualContact
+from microdrivers.estimators.vision.visual_contact import VisualContact
 
 _NAN = float("nan")
 _SLACK_PX = 4.0
@@ -72,7 +72,7 @@ class ImageScale(NamedTuple):
 
     @property
     def px_per_um(self) -> float:
-        """Displacement in the image for 1 µm along the direction of probing."""
+        """Displacement in the image for 1 µm, across the lines on which that direction's coordinate is the same."""
         return 1.0 / math.hypot(*self.um_per_px)
 
 
@@ -101,6 +101,7 @@ class DeformationTracker:
         contact: detects the touch; a `VisualContact` of its own if None.
 
     Attributes:
+        contact: what detects the touch; its `event` is None before.
         last_reason: why the newest frame gave no deformation, in words; empty when it did.
 
     Raises:
@@ -160,13 +161,10 @@ class DeformationTracker:
         if self._by_sight:
             event = self.contact.update(sample)
             if event is not None:
-                self._take_zero(event)
+                self.set_contact(tip_um=event.tip_um, deformation_um=event.deformation_um)
                 sample = self._sample(frame, tip, point)
         self._seq += 1
         return sample
-
-    def _take_zero(self, event: ContactEvent) -> None:
-        self.set_contact(tip_um=event.tip_um, deformation_um=event.deformation_um)
 
     def _sample(self, frame: Frame, tip: PatchMatch | None, point: PatchMatch | None) -> DeformationSample:
         flags = set()
@@ -256,19 +254,23 @@ class _Target:
         return match
 
     def _locate(self, image: npt.NDArray[Any], expected: FloatArray, radius_px: float) -> PatchMatch | None:
-        if self._way is None:
-            return locate(
-                self._patch, image, expected, radius_px=radius_px, min_correlation=self._limits.min_correlation
-            )
+        """Where it is expected, else about where it was last seen."""
+        least = self._limits.min_correlation
         match = self._patch.refine(image, expected)
-        if match is not None and match.correlation >= self._limits.min_correlation:
+        if match is not None and match.correlation >= least:
             return match
-        # A search by brightness alone would take what lies ahead of the tip for a part of it.
-        reach_px = min(radius_px, _WAY_PX)
-        near = locate_along(
-            self._patch, image, self._way, start=self._shift, back_px=reach_px, ahead_px=reach_px,
-            min_correlation=self._limits.min_correlation,
-        )  # fmt: skip
-        return near or locate(
-            self._patch, image, expected, radius_px=radius_px, min_correlation=self._limits.min_correlation
-        )
+        if self._way is not None:
+            # A search by brightness alone would take what lies ahead of the tip for a part of it.
+            reach_px = min(radius_px, _WAY_PX)
+            match = locate_along(
+                self._patch,
+                image,
+                self._way,
+                start=self._shift,
+                back_px=reach_px,
+                ahead_px=reach_px,
+                min_correlation=least,
+            )
+        if match is None or match.correlation < least:
+            match = locate(self._patch, image, self._shift, radius_px=radius_px, min_correlation=least)
+        return match

@@ -27,6 +27,7 @@ _TEXTURE_SIGMAS = 3.0
 _TEXTURED_SHARE = 0.5
 _TIP_EDGE_PX = 4
 _CLEAR_PX = 4
+_LEAST_GAP_PX = 3
 _RIM_PX = 4.0
 _RIM_SHARE = 0.12
 _MIN_REACH_PX = 10.0
@@ -205,11 +206,17 @@ def _onset(
     length = max(6, int(tip.width_px))
     for first in np.flatnonzero(busy).tolist():
         following = busy[first : first + length]
-        if len(following) == length and following.mean() > _TEXTURED_SHARE:
+        if len(following) == length and _longest_gap(following) <= max(_LEAST_GAP_PX, length // 5):
             while first + 1 < len(level) and level[first + 1] >= level[first]:
                 first += 1
             return start + first
     return None
+
+
+def _longest_gap(busy: BoolArray) -> int:
+    """The longest run of False."""
+    ends = np.flatnonzero(np.concatenate([[True], busy, [True]]))
+    return int(np.diff(ends).max()) - 1
 
 
 def _white(image: Float32Array, top_level: int) -> BoolArray:

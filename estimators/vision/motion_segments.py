@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from microdrivers.core.errors import DataError
 from microdrivers.estimators.vision.patch import BoolArray
 from microdrivers.estimators.vision.template import Float32Array, FloatArray
 
@@ -32,7 +33,13 @@ class EvenSeries(NamedTuple):
 
 
 def even_light(images: Sequence[npt.NDArray[Any]]) -> EvenSeries:
-    """Bring all images to the brightness of the last one, by the median over blocks of the ratio of grey levels."""
+    """Bring all images to the brightness of the last one, by the median over blocks of the ratio of grey levels.
+
+    Raises:
+        DataError: they differ in size.
+    """
+    if len({image.shape for image in images}) > 1:
+        raise DataError("the frames differ in size", remedy="keep the camera's region and binning between the frames")
     last = images[-1].astype(np.float32)
     means = _blocks(last)
     even = []

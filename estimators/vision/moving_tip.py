@@ -27,7 +27,7 @@ _MIN_CORRELATION = 0.6
 _KEPT_BEHIND_PX = 60.0
 _AHEAD_PX = 5.0
 _BEHIND_PX = 4.0
-_SUFFICIENT_PX = 0.02
+_SUFFICIENT_PX = 0.04
 _BESIDE_PX = 3
 _SLACK_PX = 2
 _MAX_RESIDUAL_PX = 0.3
@@ -54,7 +54,9 @@ class TipView(NamedTuple):
     """A probe's tip in the image of one camera, and how the image moves with the probe.
 
     Attributes:
-        patch: the tip's end; a shift of zero is where it was in the last of the frames.
+        patch: the tip's end; a shift of zero is where it was in the last of the frames. A tip with marks of its own
+            is tracked by these; of a plain one the front is needed, at which a dark membrane cannot be told from a
+            dark tip: it then reads up to half a pixel short, the same as long as they touch.
         front_px: the middle of the tip's front there, (u, v) from the centre of the top-left pixel.
         direction: of the approach in the image, a unit vector (u, v).
         width_px: of the tip near its front.
@@ -122,15 +124,16 @@ def find_moving_tip(
     shifts = _follow(first, images, share[:, None] * vector, radius_px=4.0 + 0.1 * length_px)
     mean, noise_share, restless = _mean_image(images, shifts, mask, noise)
     front = find_front(mean, region, direction)
-    patch = _choose_patch(mean, region, restless, front, direction, noise_share=noise_share, noise_levels=noise)
-    matches = _follow(patch, images, share[:, None] * vector, radius_px=4.0 + 0.1 * length_px)
+    mask = _mask(region, front, direction) & ~restless
+    whole = _require_patch(take_patch(mean, mask, noise_levels=noise, noise_share=noise_share))
+    matches = _follow(whole, images, share[:, None] * vector, radius_px=4.0 + 0.1 * length_px)
+    patch = _choose_patch(mean, mask, front, direction, noise_share=noise_share, noise_levels=noise)
     return _fit(patch, front, matches, travel, travel_sigma_um)
 
 
 def _choose_patch(
     image: Float32Array,
-    region: BoolArray,
-    restless: BoolArray,
+    mask: BoolArray,
     front: TipFront,
     direction: FloatArray,
     *,
@@ -138,7 +141,6 @@ def _choose_patch(
     noise_levels: float,
 ) -> Patch:
     """The tip without its front, if its own marks or shape suffice; else with it, whatever comes to lie ahead."""
-    mask = _mask(region, front, direction) & ~restless
     behind = mask & (front.along(direction, mask.shape) < -_BEHIND_PX)
     plain = take_patch(image, behind, noise_levels=noise_levels, noise_share=noise_share)
     if plain is not None and plain.sigma_px(noise_levels, direction) < _SUFFICIENT_PX:
@@ -234,7 +236,8 @@ def _mean_image(
     window = (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
     mean[window] = np.mean(layers, axis=0)
     spread = cv2.blur(np.var(layers, axis=0, ddof=1), (3, 3))
-    restless[window] = spread > (_RESTLESS_SIGMAS * noise_levels) ** 2
+    uneven = (spread > (_RESTLESS_SIGMAS * noise_levels) ** 2).astype(np.uint8)
+    restless[window] = cv2.dilate(uneven, np.ones((5, 5), np.uint8)) > 0
     return mean, smoothing / len(layers) ** 2, restless
 
 

@@ -66,7 +66,8 @@ class CanOpenNode:
         self.emergencies = Emergencies(self._send_emergency)
         self._application = application
         self._temper = temper or Temper()
-        self._random = random.Random(seed)
+        numbers = random.Random(seed)
+        self._draw = numbers.random
         self._lock: AbstractContextManager[object] = threading.RLock()
         self._on_disturbed: Callable[[], None] = lambda: None
         self.listens_to: Mapping[int, Handler] = {}
@@ -85,7 +86,7 @@ class CanOpenNode:
         )
         self.dictionary.add([*self.emergencies.entries(), *self._consumer.entries(), self._producer.period])
         self._sdo = SdoServer(self.dictionary)
-        clock_error = 0.0 if self._temper == PROMPT else self._random.uniform(-_CLOCK_ERROR, _CLOCK_ERROR)
+        clock_error = 0.0 if self._temper == PROMPT else numbers.uniform(-_CLOCK_ERROR, _CLOCK_ERROR)
         self._all_transmit = [
             TransmitPdo(number, defaults, timer_scale=1.0 + clock_error, **self._pdo_context(_TPDO_IDS[number - 1]))
             for number, defaults in enumerate(transmit, 1)
@@ -277,11 +278,10 @@ class CanOpenNode:
 
     def _sdo_request(self, frame: Frame, t_ns: int) -> bool:
         server, request = self._sdo, frame.data
-        before = server.transfer
         reply = server.request(request, t_ns)
         if reply is not None:
             self._reply(reply, t_ns)
-        return before is not None or server.transfer is not None or not is_upload(request)
+        return server.transfer is not None or not is_upload(request)
 
     def _sync(self, _frame: Frame, t_ns: int) -> bool:
         self._transmit.at_sync(t_ns)
@@ -332,7 +332,7 @@ class CanOpenNode:
 
     def _draw_ns(self, between_s: tuple[float, float]) -> int:
         low, high = between_s
-        return int((low + (high - low) * self._random.random()) * NS_PER_S)
+        return int((low + (high - low) * self._draw()) * NS_PER_S)
 
 
 class _PdoContext(TypedDict):

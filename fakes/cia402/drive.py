@@ -201,13 +201,13 @@ class ServoDrive:
 
     def status_at(self, t_ns: int) -> int:
         """The status word, 6041h."""
-        bits = self.state | ALWAYS
+        bits: int = self.state | ALWAYS
         mode = self.mode
         if mode is _PROFILE_POSITION:
             bits |= self._profile.status_at(t_ns)
         elif mode is _HOMING:
             bits |= self.homing.status_at(t_ns)
-        return int(bits)
+        return bits
 
     # ------------------------------------------------------------------ commands
 

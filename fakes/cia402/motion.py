@@ -109,7 +109,7 @@ class Motion:
         """From when on the table is within `window` counts of where the profile ends; None if it cannot move."""
         if self._jammed is not None:
             return None
-        return self.axis.within_from_ns(max(window, 0.5) / self._scale)
+        return self.axis.within_from_ns((window or 0.5) / self._scale)
 
     def switches_at(self, t_ns: int) -> int:
         """60FDh: bit 0 negative limit, 1 positive limit, 2 home."""

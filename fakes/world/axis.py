@@ -184,10 +184,10 @@ class Axis:
 
     def _segment_at(self, t_ns: int) -> tuple[_Segment, float]:
         with self._lock:
-            i = max(bisect.bisect_right(self._times, t_ns) - 1, 0)
-            segment = self._segments[i]
+            i = bisect.bisect_right(self._times, t_ns)
+            segment = self._segments[i - 1 if i else 0]
         # Before the oldest segment that is kept, the axis stands where that one begins.
-        return segment, max(t_ns - segment.t_ns, 0) / NS_PER_S
+        return segment, (t_ns - segment.t_ns) / NS_PER_S if i else 0.0
 
     def _cut(self, t_ns: int) -> tuple[float, float]:
         """Forget what was planned after `t_ns`; returns the set-point there."""

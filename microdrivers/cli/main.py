@@ -131,4 +131,8 @@ _add(main, "clear-fault", "microdrivers.cli.clear_fault", "clear_fault", "Clear 
 _add(main, "serve", "microdrivers.cli.serve", "serve", "Put every emulator of a rig on a port for other programs.")
 _add(main, "snap", "microdrivers.cli.snap", "snap", "Take one fresh frame and write it to a file.")
 _add(main, "record", "microdrivers.cli.record", "record", "Record what every device tells, frames included.")
+_add(main, "replay", "microdrivers.cli.replay", "replay", "Publish a recording again, in recorded order.")
+_add(main, "info", "microdrivers.cli.info", "info", "What a recording holds, and what it has lost.")
+_add(main, "export", "microdrivers.cli.export", "export", "A recording as CSV, Parquet, HDF5, images or video.")
+_add(main, "analyse", "microdrivers.cli.analyse", "analyse", "Analyse many recordings into one table.")
 _add(recording, "repair", "microdrivers.cli.recording", "repair", "Make a torn recording readable by any tool.")

@@ -23,13 +23,13 @@ class TerminalProgress:
         if not self._quiet:
             click.echo(f"· {text}", err=True)
 
-    def count(self, done: int, total: int) -> None:
+    def count(self, done: int, total: int, *, what: str = "frames") -> None:
         """So much of the present phase is done."""
         if self._quiet or not self._live:
             return
         filled = round(_BAR_WIDTH * done / total) if total else _BAR_WIDTH
         bar = "█" * filled + "░" * (_BAR_WIDTH - filled)
-        click.echo(f"\r  {bar} {done}/{total} frames", nl=False, err=True)
+        click.echo(f"\r  {bar} {done}/{total} {what}", nl=False, err=True)
         self._bar_open = True
 
     def close(self) -> None:

@@ -22,3 +22,8 @@ def is_wanted(topic: str, patterns: Collection[str] | None) -> bool:
     if patterns is None:
         return not wire
     return any(fnmatchcase(topic, pattern) for pattern in patterns if not wire or pattern.endswith(_WIRE_SUFFIX))
+
+
+def literal(topic: str) -> str:
+    """The pattern that matches this topic alone."""
+    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in topic)

@@ -92,7 +92,8 @@ def _descriptions(sample_type: type[Sample]) -> dict[str, str]:
     text = " ".join((inspect.getdoc(sample_type) or "").partition("Attributes:")[2].split())
     found: dict[str, str] = {}
     matches = list(_NAMES.finditer(text))
-    for match, following in zip(matches, [*matches[1:], None], strict=True):
-        said = text[match.end() : following.start() if following is not None else None].strip().rstrip(".")
+    ends = [*(match.start() for match in matches[1:]), len(text)]
+    for match, end in zip(matches, ends, strict=False):
+        said = text[match.end() : end].strip().rstrip(".")
         found |= dict.fromkeys(match[1].split(", "), said)
     return {name: said for name, said in found.items() if name in sample_type.__struct_fields__}

@@ -59,12 +59,16 @@ class Recording:
         self._damaged: dict[int, Loss] = {}
         self._unreadable: dict[tuple[int, int], str] = {}
 
-    def samples(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, Sample]]:
-        """Topic and sample, in recorded order; frames with their images. `topics` may hold patterns: `truth/*`.
+    def samples(
+        self, topics: Collection[str] | None = None, *, leave_out: Collection[str] = ()
+    ) -> Iterator[tuple[str, Sample]]:
+        """Topic and sample, in recorded order; frames with their images.
+
+        `topics` and `leave_out` may hold patterns: `truth/*`.
 
         Each call reads the file anew. What cannot be read is left out, and is told by `losses`.
         """
-        return self._walk(topics, lambda reader: reader.take)
+        return self._walk(topics, lambda reader: reader.take, leave_out=leave_out)
 
     @cached_property
     def _survey(self) -> Survey:
@@ -112,7 +116,11 @@ class Recording:
     # ------------------------------------------------------------------ messages
 
     def _walk(
-        self, topics: Collection[str] | None, action: Callable[[ChannelReader], Action[FoundT]]
+        self,
+        topics: Collection[str] | None,
+        action: Callable[[ChannelReader], Action[FoundT]],
+        *,
+        leave_out: Collection[str] = (),
     ) -> Iterator[tuple[str, FoundT]]:
         """Topic, and what the channel's action makes of each message of the wanted topics, if it makes anything."""
         actions: dict[int, tuple[ChannelReader, Action[FoundT]] | None] = {}
@@ -121,7 +129,8 @@ class Recording:
 
         def define(channel: Channel) -> None:
             reader = channel_reader(channel, schemas.get(channel.schema_id), joins)
-            actions[channel.id] = (reader, action(reader)) if _is_wanted(reader.topic, topics) else None
+            wanted = _is_wanted(reader.topic, topics) and not (leave_out and _is_wanted(reader.topic, leave_out))
+            actions[channel.id] = (reader, action(reader)) if wanted else None
 
         for channel in self._scan.channels.values():
             define(channel)

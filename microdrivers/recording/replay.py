@@ -6,12 +6,11 @@ import heapq
 import itertools
 import json
 from collections.abc import Collection, Iterator
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
-from microdrivers.core.bus import Bus
+from microdrivers.core.bus import Bus, Topic
 from microdrivers.core.clock import Clock
-from microdrivers.core.samples import RoutineNote, Sample
+from microdrivers.core.samples import Frame, RoutineNote, Sample
 from microdrivers.recording.reader import Recording
 
 ROUTINE = "routine"
@@ -20,6 +19,8 @@ ESTIMATES = ("estimate/*", "*/track", "*/deformation", ROUTINE)
 
 _READ_AHEAD = 2000
 """Samples by which the file's order may differ from the bus's: threads publish side by side."""
+_FRAMES_AHEAD = 64
+"""No more of them are frames: they are large."""
 
 
 class Note(NamedTuple):
@@ -66,11 +67,12 @@ class Replay:
         self.published = 0
         self.missing = 0
         self._bus = bus
-        self._leave_out = leave_out
-        self._source: Iterator[tuple[str, Sample]] = recording.samples()
+        self._source: Iterator[tuple[str, Sample]] = recording.samples(leave_out=leave_out)
         self._waiting: list[tuple[int, int, str, Sample]] = []
+        self._frames_waiting = 0
+        self._topics: dict[str, Topic[Any]] = {}
         self._ties = itertools.count()
-        self._arrivals = recording.arrivals
+        self._recording = recording
         self._clock = clock
         self._speed = speed
         self._began_ns: tuple[int, int] | None = None
@@ -82,16 +84,17 @@ class Replay:
 
     def as_arrived(self, host: str, order: int | None) -> None:
         """As `up_to`, with the samples of one inbox in the order in which it got them."""
-        if host not in self._arrivals:
+        arrivals = self._recording.arrivals
+        if host not in arrivals:
             self.up_to(order)
             return
         first = self._waiting[0][0] if self._fill() else 0
-        ordered = [each for each in self._arrivals[host] if each >= first and (order is None or each < order)]
+        ordered = [each for each in arrivals[host] if each >= first and (order is None or each < order)]
         members = set(ordered)
         early: dict[int, tuple[str, Sample]] = {}
         for wanted in ordered:
             while wanted not in early and self._fill() and self._waiting[0][0] <= wanted:
-                number, _, topic, sample = heapq.heappop(self._waiting)
+                number, topic, sample = self._take_next()
                 if number in members:
                     early[number] = (topic, sample)
                 else:
@@ -104,28 +107,35 @@ class Replay:
 
     def _fill(self) -> bool:
         """Read ahead; tells whether anything is left."""
-        while len(self._waiting) < _READ_AHEAD:
+        while len(self._waiting) < _READ_AHEAD and self._frames_waiting < _FRAMES_AHEAD:
             entry = next(self._source, None)
             if entry is None:
                 break
             topic, sample = entry
-            if not any(fnmatchcase(topic, pattern) for pattern in self._leave_out):
-                heapq.heappush(self._waiting, (sample.order, next(self._ties), topic, sample))
+            self._frames_waiting += isinstance(sample, Frame)
+            heapq.heappush(self._waiting, (sample.order, next(self._ties), topic, sample))
         return bool(self._waiting)
 
+    def _take_next(self) -> tuple[int, str, Sample]:
+        number, _, topic, sample = heapq.heappop(self._waiting)
+        self._frames_waiting -= isinstance(sample, Frame)
+        return number, topic, sample
+
     def _publish_next(self) -> None:
-        _, _, topic, sample = heapq.heappop(self._waiting)
+        _, topic, sample = self._take_next()
         self._publish(topic, sample)
 
     def _publish(self, topic: str, sample: Sample) -> None:
-        self._keep_pace(sample)
+        if self._speed is not None and self._clock is not None:
+            self._keep_pace(sample, self._clock, self._speed)
         self.published += 1
-        self._bus.topic(topic, type(sample)).publish(sample)
+        found = self._topics.get(topic)
+        if found is None or found.sample_type is not type(sample):
+            found = self._topics[topic] = self._bus.topic(topic, type(sample))
+        found.publish(sample)
 
-    def _keep_pace(self, sample: Sample) -> None:
-        if self._clock is None or self._speed is None:
-            return
+    def _keep_pace(self, sample: Sample, clock: Clock, speed: float) -> None:
         if self._began_ns is None:
-            self._began_ns = self._clock.now_ns(), sample.t_ns
+            self._began_ns = clock.now_ns(), sample.t_ns
         start_ns, first_ns = self._began_ns
-        self._clock.sleep_until(start_ns + round((sample.t_ns - first_ns) / self._speed))
+        clock.sleep_until(start_ns + round((sample.t_ns - first_ns) / speed))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import Frame, Sample
 from microdrivers.core.units import NS_PER_S
-from microdrivers.recording.channels import TRUTH_PREFIX
+from microdrivers.recording.channels import TRUTH_PREFIX, literal
 from microdrivers.recording.columns import Column, columns_of, describe, unit_of
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.survey import TopicSummary
@@ -97,7 +97,7 @@ def batches_of(
     """
     kind = summary_of(recording, topic).sample_type
     batch: list[Sample] = []
-    for _, sample in samples_without_images(recording, topic):
+    for _, sample in sampleswithout_images(recording, topic):
         batch.append(sample)
         if len(batch) == size:
             yield arrays_of(batch, kind, start_ns=start_ns)
@@ -106,11 +106,11 @@ def batches_of(
         yield arrays_of(batch, kind, start_ns=start_ns)
 
 
-def samples_without_images(recording: Recording, topic: str) -> Iterator[tuple[str, Sample]]:
+def sampleswithout_images(recording: Recording, topic: str) -> Iterator[tuple[str, Sample]]:
     """A topic's samples; of frames, only the batch in work is kept, images excepted."""
     for name, sample in recording.samples((literal(topic),)):
         if isinstance(sample, Frame):
-            yield name, _without_image(sample)
+            yield name, without_image(sample)
         else:
             yield name, sample
 
@@ -118,14 +118,10 @@ def samples_without_images(recording: Recording, topic: str) -> Iterator[tuple[s
 _NO_IMAGE: npt.NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
 
 
-def _without_image(frame: Frame) -> Frame:
+def without_image(frame: Frame) -> Frame:
+    """The frame with an empty image: what is kept of it until a batch is full."""
     fields = {name: getattr(frame, name) for name in frame.__struct_fields__}
     return Frame(**fields | {"image": _NO_IMAGE})
-
-
-def literal(topic: str) -> str:
-    """The pattern that matches this topic alone."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in topic)
 
 
 # ---------------------------------------------------------------------- views

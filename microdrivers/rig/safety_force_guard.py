@@ -25,7 +25,6 @@ BY = "force guard"
 
 LIMIT_RULE, DATA_RULE, TARE_RULE, RETRACTION_RULE = "force limit", "force data", "tare", "retraction"
 
-_NO_FORCE = frozenset({DISCONNECTED, STALE})
 _BELOW_SHARE = 0.95
 """Of the limit: a trip is over below it, so that noise at the limit is not a trip a reading."""
 
@@ -34,8 +33,8 @@ _WORSE_SHARE = 0.1
 
 _AGAIN_NS = 20 * NS_PER_MS
 _LIMIT_REMEDY = (
-    "look at what the tool touches. Moves are refused until the force is back below the limit and the tool has been "
-    "taken away; stop() and retract() are not"
+    "look at what the tool touches; only stop() and retract() pass until the force is back below the limit and the "
+    "tool has been taken away"
 )
 _DATA_REMEDY = "check the force sensor, its cable and its amplifier; stop() and retract() work all the same"
 
@@ -158,11 +157,13 @@ class ForceGuard:
 
     def take(self, sample: ForceSample) -> None:
         """Judge a reading, and stop at once if it demands that; in the publisher's thread."""
+        if STALE in sample.flags:
+            return  # it is no reading: the age of the last one decides
         force_uN = self._judged_uN(sample)
         if abs(sample.tare_uN) > self.settings.zero_uN and sample.tare_uN != self._doubted_tare_uN:
             self._doubt_tare(sample.tare_uN)
         if math.isnan(force_uN):
-            self._flow.invalid(", ".join(sorted(sample.flags & _NO_FORCE)) or "no number")
+            self._flow.invalid(DISCONNECTED if DISCONNECTED in sample.flags else "no number")
             self._hold_while_blind()
             return
         self._flow.heard(sample.t_ns)
@@ -173,7 +174,7 @@ class ForceGuard:
 
     def _judged_uN(self, sample: ForceSample) -> float:
         """The force that counts; infinite if it is beyond the sensor's range, NaN if it is not known."""
-        if sample.flags & _NO_FORCE:
+        if DISCONNECTED in sample.flags:
             return math.nan
         if SATURATED in sample.flags:
             return math.inf

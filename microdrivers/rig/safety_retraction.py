@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 
 from microdrivers.core.clock import Clock, Timer
-from microdrivers.core.errors import BusyError, LinkError, MicrodriversError
+from microdrivers.core.errors import BusyError, LinkError, MicrodriversError, MoveSuperseded
 from microdrivers.core.samples import FineStageSample
 from microdrivers.core.units import seconds_to_ns
 from microdrivers.devices.fine_stage import FineStage
@@ -99,6 +99,9 @@ class Retraction:
             return
         try:
             pose = self._move.look()
+        except MoveSuperseded:  # nothing but a retraction is let through now
+            self._end("somebody else's retract() has replaced it", succeeded=True)
+            return
         except LinkError as error:
             if self._clock.now_ns() >= self._move.deadline_t_ns:
                 raise

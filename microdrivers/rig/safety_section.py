@@ -18,8 +18,6 @@ from microdrivers.rig.yaml_file import Document, Location
 if TYPE_CHECKING:
     from microdrivers.rig.rig_file import DeviceEntry, RigFile
 
-Point = tuple[float, float, float]
-
 NONE = "none"
 _ZERO_SHARE = 0.1
 _LEAST_PERIODS = 2.0
@@ -42,6 +40,12 @@ def _immutable(value: Any) -> Any:
     return {key: _immutable(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
+def _three(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != len(_AXES):
+        raise ValueError("a point is needed here: [x, y, z] in µm, in the rig's frame")
+    return value
+
+
 def _nothing_at_all(value: Any) -> Any:
     if value == NONE:
         return {"force_guards": NONE, "keep_out": NONE}
@@ -52,6 +56,9 @@ def _nothing_at_all(value: Any) -> Any:
 
 def _or_none(items: tuple[Any, ...]) -> Any:
     return [item.model_dump(mode="json") for item in items] or NONE
+
+
+Point = Annotated[tuple[float, float, float], pydantic.BeforeValidator(_three)]
 
 
 class ForceGuardSettings(DeviceSettings):

@@ -18,6 +18,9 @@ from pathlib import Path
 from .job import NotUsable
 
 QEMU = "qemu-system-x86_64"
+_TOOLS = {QEMU: "qemu-system-x86", "ip": "iproute2"}
+"""What the qemu backend needs of this machine. The guest has the same files: `ip` is for its CAN controllers."""
+
 _PRELOAD_SOURCES = tuple(Path(__file__).with_name(name) for name in ("uml_xsave.c", "uml_clock.c"))
 _XZ_MAGIC = b"\xfd7zXZ\0"
 
@@ -46,7 +49,7 @@ class Cache:
     @property
     def has_qemu(self) -> bool:
         """Whether the `qemu` backend is set up."""
-        return shutil.which(QEMU) is not None and self.linux.is_dir() and self.busybox.is_file()
+        return not _missing() and self.linux.is_dir() and self.busybox.is_file()
 
 
 def set_up_uml(cache: Cache) -> None:
@@ -55,11 +58,9 @@ def set_up_uml(cache: Cache) -> None:
     Raises:
         NotUsable: something cannot be fetched, or there is no C compiler and the user is not root.
     """
-    if not (cache.busybox.is_file() and cache.uml.is_dir()):
-        _require_debian()
-        _set_up_busybox(cache)
-        if not cache.uml.is_dir():
-            _make(cache.uml, lambda folder: _unpack("user-mode-linux", folder))
+    _set_up_busybox(cache)
+    if not cache.uml.is_dir():
+        _make(cache.uml, lambda folder: _unpack("user-mode-linux", folder))
     newest_s = max(source.stat().st_mtime for source in _PRELOAD_SOURCES)
     if cache.uml_preload.is_file() and cache.uml_preload.stat().st_mtime >= newest_s:
         return
@@ -71,19 +72,27 @@ def set_up_uml(cache: Cache) -> None:
 
 
 def set_up_qemu(cache: Cache) -> None:
-    """QEMU, and Debian's kernel with its modules (470 MB).
+    """QEMU and a tool, and Debian's kernel with its modules (470 MB).
 
     Raises:
-        NotUsable: something cannot be fetched, or QEMU is missing and the user is not root.
+        NotUsable: something cannot be fetched, or must be installed and the user is not root.
     """
     if cache.has_qemu:
         return
-    _require_debian()
-    if shutil.which(QEMU) is None:
-        _install("qemu-system-x86")
+    if missing := _missing():
+        _install(*missing)
     _set_up_busybox(cache)
     if not cache.linux.is_dir():
         _make(cache.linux, lambda folder: _unpack_kernel(folder, cache.busybox))
+
+
+def _missing() -> list[str]:
+    """Packages that the qemu backend needs and that are not installed; a user's search path may lack sbin."""
+    return [
+        package
+        for tool, package in _TOOLS.items()
+        if shutil.which(tool) is None and shutil.which(tool, path="/usr/sbin:/sbin") is None
+    ]
 
 
 def _set_up_busybox(cache: Cache) -> None:
@@ -128,6 +137,7 @@ def _kernel_package() -> str:
 
 def _unpack(package: str, folder: Path) -> None:
     """Download a package and unpack it into a folder."""
+    _require_debian()
     say(f"fetching {package}")
     with tempfile.TemporaryDirectory() as scratch:
         # apt would download as a user of its own, who may not write here. It checks signatures in any case.
@@ -143,6 +153,7 @@ def _unpack(package: str, folder: Path) -> None:
 
 def _install(*packages: str) -> None:
     names = " ".join(packages)
+    _require_debian()
     command = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *packages]
     if os.geteuid() != 0:
         raise NotUsable(f"{names} is missing and only root can install it: sudo {' '.join(command)}")

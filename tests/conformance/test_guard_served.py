@@ -15,12 +15,16 @@ pytestmark = pytest.mark.ports
 
 PATIENT_MS = 1000
 RETRACT_UM = 400.0
+SAFETY = {
+    "force_guards": [{"sensor": SENSOR, "stage": STAGE, "max_force_uN": LIMIT_UN, "stale_after_ms": PATIENT_MS}],
+    "keep_out": "none",
+}
 
 
 @pytest.fixture
 def served(tmp_path):
     """The rig on its ports, and the world behind it."""
-    file = write_rig_file(tmp_path, stage={"heartbeat_ms": PATIENT_MS})
+    file = write_rig_file(tmp_path, safety=SAFETY, stage={"heartbeat_ms": PATIENT_MS})
     pointing = tmp_path / "served.yaml"
     with ServedRig(load_rig_file(file), seed=3) as serving:
         serving.write(pointing)

@@ -183,12 +183,15 @@ def test_who_waits_for_an_event_may_go_on_after_any_call():
 
     def fire():
         event.set()
-        seen.append((clock.free_until_ns(), clock.go_on_at(2 * MS)))
+        seen.append((clock.free_until_ns(), clock.go_on_at(3 * MS)))
 
-    clock.call_at(MS, fire)
+    clock.call_at(MS, lambda: 1 / 0)
+    clock.call_at(2 * MS, fire)
+    with pytest.raises(ZeroDivisionError):
+        clock.sleep(0.01)  # until when nobody else could act, had it not failed
     assert event.wait(1.0)
-    assert seen == [(MS, False)]
-    assert clock.now_ns() == MS
+    assert seen == [(2 * MS, False)]
+    assert clock.now_ns() == 2 * MS
 
 
 def test_what_follows_an_exchange_comes_once_and_before_all_others():

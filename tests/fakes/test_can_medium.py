@@ -248,6 +248,33 @@ def test_nodes_get_what_they_listen_to_and_keep_their_own_times(clock: Simulated
     assert node.advanced == [START_NS + n * NS_PER_MS for n in range(13)]
 
 
+def test_a_node_may_have_a_frame_ready_at_the_very_end_of_another(clock: SimulatedClock, medium: Medium) -> None:
+    class Punctual(Listener):
+        listens_to: Container[int] = ()
+        due_ns: int | None = START_NS + NS_PER_MS + SYNC_BITS * BIT_NS
+
+        def receive(self, frame: Frame, t_ns: int) -> Sequence[Due]:
+            return self.advance(t_ns)
+
+        def advance(self, t_ns: int) -> Sequence[Due]:
+            if t_ns != self.due_ns:
+                return ()
+            self.due_ns = None
+            return (Due(t_ns, Frame(0x100)),)
+
+        def next_event_ns(self) -> int | None:
+            return self.due_ns
+
+    port, other = medium.open_port(), medium.open_port()
+    medium.attach(Punctual())
+    port.send(SYNC)
+    clock.sleep(0.001)
+    port.send(SYNC)
+    other.send(Frame(0x400))
+    clock.sleep(0.01)
+    assert passed(medium) == [0x080, 0x080, 0x100, 0x400]
+
+
 def test_a_frame_can_be_read_soon_after_it_has_arrived(clock: SimulatedClock) -> None:
     medium = Medium("can0", clock=clock, bitrate=500_000, seed=1)
     port = medium.open_port()

@@ -146,6 +146,18 @@ def test_a_new_request_takes_the_place_of_half_a_transfer() -> None:
     assert bench.wait_ms(3000) == []
 
 
+@pytest.mark.parametrize("request_hex", [f"40 {multiplexor(TEXT)} 00 00 00 00", f"21 {multiplexor(TEXT)} 08 00 00 00"])
+def test_half_a_transfer_ends_in_time_unless_something_else_is_read(request_hex: str) -> None:
+    bench = PlainBench()
+    bench.node.dictionary[TEXT, 0].value = "longer than four bytes"
+    for reads in (False, True):
+        assert bench.ask(request_hex)
+        if reads:
+            bench.read(0x2101)
+        assert [hex_of(frame.data) for frame in bench.wait_ms(1500)] == ([] if reads else [abort(TEXT, 0x05040000)])
+    assert bench.node.next_event_ns() is None
+
+
 def test_an_upload_is_of_one_instant() -> None:
     bench = PlainBench()
     bench.node.dictionary[TEXT, 0].value = "the first value"

@@ -109,7 +109,7 @@ MISTAKES = {
     "an empty list": (f"  keep_out:\n{BOX}", f"  keep_out: []\n#{BOX}", "a list is needed here", "correct the value"),
     "half a section": ("  keep_out:", "  keep_uot:", "unknown key", "did you mean 'keep_out'"),
     "a box inside out": ("max_um: [15000, 15000, -500]", "max_um: [15000, 15000, -5500]", "along z a box", "correct"),
-    "a flat point": ("min_um: [0, 0, -5000]", "min_um: [0, 0]", "3", ""),
+    "a flat point": ("min_um: [0, 0, -5000]", "min_um: [0, 0]", "a point is needed here: [x, y, z]", "correct"),
     "two boxes of a name": (
         BOX, f"    - {{name: slide, min_um: [0, 0, 0], max_um: [1, 1, 1]}}\n{BOX}",
         "'slide' stands here twice", "keep one",

@@ -119,6 +119,7 @@ def test_only_retractions_pass_until_the_tool_is_away(tmp_path):
         guarded.stage.retract().wait()
         guarded.clock.sleep(0.1)
         assert not guarded.rig.safety.tripped
+        assert "somebody else's retract() has replaced it" in guarded.interventions[-1].reason
         guarded.stage.move_to(x_um=0.0)
         guarded.other.move_to(z_um=10.0)
 

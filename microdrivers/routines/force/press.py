@@ -329,7 +329,8 @@ class PressExperiment:
     # ------------------------------------------------------------------ afterwards
 
     def finish(self) -> None:
-        """Stop, and take the probe away if it has touched something."""
+        """Stop, and take the probe away if it has touched something; a guard that does so already is let finish."""
+        self._rig.safety.finish()
         self._stage.stop(by="characterisation", reason="the experiment ended")
         if self._touched and self._stage.link == "open" and self._stage.retract_um is not None:
             self._rest()

@@ -55,11 +55,11 @@ def test_the_scale_is_as_uncertain_as_it_says(contact_scenes: ModuleType) -> Non
     travel_um = [0.0, 14.0, 33.0, 61.3, 80.0]
     greys = [scene.grey(tip_um=x - 130.0) for x in travel_um]
     z = []
-    for _ in range(12):
+    for _ in range(18):
         tip = find(scene, [scene.digitise(grey) for grey in greys], travel_um)
         z.append((tip.scale_px_per_um - scene.look.scale_px_per_um) / tip.scale_sigma_px_per_um)
-    # The least squares' own residuals widen the sigma where chance makes them large, and never narrow it.
-    assert 0.35 < np.mean(np.square(z)) < 1.4
+    # Residuals widen the sigma where chance makes them large, and never narrow it.
+    assert 0.4 < np.mean(np.square(z)) < 1.5
 
 
 def test_dust_and_flicker_do_not_matter(contact_scenes: ModuleType) -> None:
@@ -143,5 +143,7 @@ def test_travel_must_make_sense(contact_scenes: ModuleType) -> None:
         find(scene, frames, travel_um[::-1])
     with pytest.raises(OutOfRange, match="px only"):
         find(scene, frames, [0.0, 1.0, 2.0])
+    with pytest.raises(DataError, match="differ in size"):
+        find(scene, [*frames[:2], scene.frame(frames[2].image[:150])], travel_um)
     with pytest.raises(DataError, match="grey image"):
         find(scene, [scene.frame(np.zeros((180, 240, 3), dtype=np.uint8))] * 3, travel_um)

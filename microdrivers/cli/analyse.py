@@ -1,0 +1,55 @@
+"""`microdrivers analyse`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.progress import TerminalProgress
+
+
+@click.command(short_help="Analyse many recordings into one table.")
+@click.argument("runs", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Parallel processes.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="TABLE", default=Path("analysis.csv"), show_default=True,
+    help="New table, .csv or .parquet.",
+)  # fmt: skip
+@click.option("--dask", metavar="ADDRESS", help="A Dask scheduler instead of processes, such as tcp://10.0.0.5:8786.")
+def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> None:
+    """Run the analysis again that each recording of RUNS holds, and write a table of results, one row a recording.
+
+    RUNS are recordings, or folders with some in or below them. Optical calibrations and force characterisations are
+    estimated anew from what was recorded. A file that cannot be analysed has a row that says why. After Ctrl-C or a
+    kill, the same command goes on where it was.
+
+    \b
+    Examples:
+      microdrivers analyse runs/ --jobs 4
+      microdrivers analyse monday/*.mcap --out monday.parquet
+      microdrivers analyse runs/ --dask tcp://10.0.0.5:8786
+    """
+    from microdrivers.routines.analysis import analyse_recordings, find_recordings
+
+    files = find_recordings(runs)
+    progress = TerminalProgress()
+    progress.step(f"{len(files)} recordings")
+    try:
+        report = analyse_recordings(
+            files, out, jobs=jobs, dask=dask,
+            on_progress=lambda done, total: progress.count(done, total, what="recordings"),
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        progress.close()
+        click.echo(f"interrupted; the same command goes on where it was ({out}.journal)", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    finally:
+        progress.close()
+    resumed = f", {report.resumed} of them from an earlier run" if report.resumed else ""
+    click.echo(f"{out}: {len(report.rows)} recordings{resumed}, {report.failed} with errors")
+    for row in report.rows:
+        if row["error"] is not None:
+            click.echo(f"  {row['file']}: {row['error']}", err=True)

@@ -1,0 +1,148 @@
+"""A camera's frames as numbered images, and as a video."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from microdrivers.core.errors import MicrodriversError
+from microdrivers.core.samples import Frame, Sample, XYThetaSample, ZoomSample
+from microdrivers.core.units import NS_PER_S
+from microdrivers.recording.channels import literal
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.replay import notes_of
+
+_INFO = ("t_ns", "exposure_ms", "frame_id", "seq", "dropped_before", "settings_id", "bit_depth")
+
+
+class Track(NamedTuple):
+    """Recorded values over time: t_ns, and one array a field."""
+
+    t_ns: npt.NDArray[np.int64]
+    values: Mapping[str, npt.NDArray[np.float64]]
+
+    def at(self, t_ns: int) -> dict[str, float]:
+        """The values of one instant, linear between samples; NaN before the first and after the last."""
+        since = (self.t_ns - t_ns).astype(float)
+        return {
+            name: float(np.interp(0.0, since, array, left=math.nan, right=math.nan))
+            for name, array in self.values.items()
+        }
+
+
+def track_of(recording: Recording, camera: str) -> list[Track]:
+    """Pose and zoom of what the camera sees: as the recorded routine says or, if none does, the only ones there are."""
+    names: dict[str, Any] = {}
+    for note in notes_of(recording):
+        told = note.content.get("names") if isinstance(note.content, dict) else None
+        if isinstance(told, dict) and told.get("camera") == camera:
+            names = told
+    tracks = []
+    for key, kind, fields in (("stage", XYThetaSample, ("x_um", "y_um")), ("zoom", ZoomSample, ("zoom",))):
+        there = [name for name, found in recording.topics.items() if found.sample_type is kind and found.count]
+        topic = names.get(key) if names.get(key) in there else there[0] if len(there) == 1 else None
+        if topic is not None:
+            samples = sorted((s for _, s in recording.samples([literal(topic)])), key=lambda sample: sample.t_ns)
+            values = {field: np.array([getattr(sample, field) for sample in samples]) for field in fields}
+            tracks.append(Track(np.array([sample.t_ns for sample in samples], dtype=np.int64), values))
+    return tracks
+
+
+class ImageFolder:
+    """Writes frames as numbered PNG files, lossless, with `frames.csv`, as `calibrate optics --images` reads it."""
+
+    batch = 1
+
+    def __init__(self, folder: Path, tracks: list[Track], *, start_ns: int) -> None:
+        folder.mkdir()
+        self._folder = folder
+        self._tracks = tracks
+        self._start_ns = start_ns
+        self._count = 0
+        self._stream = (folder / "frames.csv").open("x", encoding="utf-8", newline="")
+        self._table = csv.writer(self._stream, lineterminator="\n")
+        self._table.writerow(["file", "time_s", *(name for track in tracks for name in track.values), *_INFO])
+
+    def write(self, samples: list[Sample]) -> None:
+        """Append frames."""
+        import cv2
+
+        for frame in samples:
+            assert isinstance(frame, Frame)
+            name = f"{self._count:06d}.png"
+            done, data = cv2.imencode(".png", np.ascontiguousarray(frame.image), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            if not done:
+                raise MicrodriversError(f"frame {frame.seq} could not be made a PNG", remedy="export to hdf5")
+            (self._folder / name).write_bytes(data.tobytes())
+            places = [value for track in self._tracks for value in track.at(frame.t_ns).values()]
+            time_s = (frame.t_ns - self._start_ns) / NS_PER_S
+            self._table.writerow([name, time_s, *places, *(getattr(frame, field) for field in _INFO)])
+            self._count += 1
+
+    def close(self) -> None:
+        """Complete the table."""
+        self._stream.close()
+
+
+class VideoFile:
+    """Writes frames as Motion JPEG at a constant rate: lossy, 8 bit, without their times. To look at, not to measure.
+
+    Attributes:
+        left_out: frames of another size than the first one.
+    """
+
+    batch = 1
+
+    def __init__(self, file: Path, *, rate_hz: float) -> None:
+        self.left_out = 0
+        self._file = file
+        self._rate_hz = rate_hz if math.isfinite(rate_hz) and rate_hz > 0 else 30.0
+        self._shape: tuple[int, ...] = ()
+        self._writer: Any = None
+
+    def write(self, samples: list[Sample]) -> None:
+        """Append frames."""
+        import cv2
+
+        for frame in samples:
+            assert isinstance(frame, Frame)
+            image = eight_bit(frame)
+            if self._writer is None:
+                self._open(image.shape)
+            if image.shape == self._shape:
+                self._writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+            else:
+                self.left_out += 1
+
+    def _open(self, shape: tuple[int, ...]) -> None:
+        import cv2
+
+        self._shape = shape
+        size = (shape[1], shape[0])
+        fourcc = cv2.VideoWriter.fourcc(*"MJPG")
+        # In colour: OpenCV's own encoder writes grey textures as broken streams.
+        self._writer = cv2.VideoWriter(str(self._file), cv2.CAP_OPENCV_MJPEG, fourcc, self._rate_hz, size, True)
+        if not self._writer.isOpened():
+            raise MicrodriversError(
+                f"no video of {size[0]}×{size[1]} px can be written", remedy="export to images, and check the disk"
+            )
+
+    def close(self) -> None:
+        """Complete the file."""
+        if self._writer is not None:
+            self._writer.release()
+
+
+def eight_bit(frame: Frame) -> npt.NDArray[np.uint8]:
+    """The image with its upper 8 significant bits."""
+    image = frame.image
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    reduced: npt.NDArray[np.uint8] = np.minimum(image >> max(frame.bit_depth - 8, 0), 255).astype(np.uint8)
+    return reduced

@@ -1,0 +1,168 @@
+"""Exports a recording in one pass, a batch of samples at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from contextlib import ExitStack
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol, get_args
+
+from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.samples import Frame, Sample
+from microdrivers.recording.channels import literal
+from microdrivers.recording.export.hdf5 import Hdf5File, text_widths
+from microdrivers.recording.export.pictures import ImageFolder, VideoFile, track_of
+from microdrivers.recording.export.tables import CsvTopic, ParquetTopic
+from microdrivers.recording.export.target import file_names, staged
+from microdrivers.recording.mcap_scan import Loss
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.survey import TopicSummary
+from microdrivers.recording.views import optional_module, start_ns, without_image
+
+Format = Literal["csv", "parquet", "hdf5", "images", "video"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+_NEEDS: Mapping[Format, str] = {"parquet": "pyarrow", "hdf5": "h5py"}
+_REPORT_EVERY = 100
+
+
+class TopicWriter(Protocol):
+    """Writes one topic, `batch` samples at a time."""
+
+    batch: int
+
+    def write(self, samples: list[Sample]) -> None:
+        """Append samples."""
+
+    def close(self) -> None:
+        """Complete what was written."""
+
+
+class ExportReport(NamedTuple):
+    """What was exported: number of samples by file or folder, and what could not be read or written."""
+
+    written: Mapping[Path, int]
+    losses: list[Loss]
+    remarks: list[str]
+
+
+def export_recording(
+    recording: Recording,
+    to: Format,
+    out: Path,
+    *,
+    topics: Collection[str] | None = None,
+    on_progress: Callable[[int, int], object] = lambda _done, _total: None,
+) -> ExportReport:
+    """Write a recording's topics to the folder `out`, which is made if it is not there.
+
+    One file a topic (a folder of images for `images`), one for all of them for `hdf5`. The files appear when all of
+    them are complete; an export that fails or is interrupted leaves none.
+
+    Args:
+        recording: what is exported.
+        to: one of `FORMATS`.
+        out: a folder.
+        on_progress: told samples done and in all.
+        topics: names or patterns; default: all, and of `images` and `video` all cameras.
+
+    Raises:
+        UnsupportedError: no topic is left to export, or what the format needs is not installed.
+        ConfigError: a file exists, or cannot be written.
+    """
+    if to in _NEEDS:
+        optional_module(_NEEDS[to])
+    chosen = _choose(recording, to, topics)
+    names = file_names(chosen)
+    start = start_ns(recording)
+    total = sum(found.count for found in chosen.values())
+    written = dict.fromkeys(chosen, 0)
+    with ExitStack() as outer:
+        suffix = {"csv": ".csv", "parquet": ".parquet", "images": "", "video": ".avi"}.get(to, "")
+        files = {topic: f"{recording.file.stem}.h5" if to == "hdf5" else f"{names[topic]}{suffix}" for topic in chosen}
+        stage = outer.enter_context(staged(out, dict.fromkeys(files.values())))
+        writers: dict[str, TopicWriter] = {}
+        with ExitStack() as stack:
+            make = _maker(recording, to, stage, files, names, start, stack, list(chosen))
+            for topic, found in chosen.items():
+                writers[topic] = make(topic, found)
+                stack.callback(writers[topic].close)
+            waiting: dict[str, list[Sample]] = {topic: [] for topic in chosen}
+            done = 0
+            for topic, sample in recording.samples([literal(topic) for topic in chosen]):
+                batch = waiting[topic]
+                batch.append(sample if to in ("hdf5", "images", "video") else _light(sample))
+                written[topic] += 1
+                done += 1
+                if len(batch) >= writers[topic].batch:
+                    writers[topic].write(batch)
+                    waiting[topic] = []
+                if done % _REPORT_EVERY == 0:
+                    on_progress(done, total)
+            for topic, batch in waiting.items():
+                if batch:
+                    writers[topic].write(batch)
+            on_progress(done, total)
+    remarks = [
+        f"{topic}: {writer.left_out} frames of another size than the first one were left out"
+        for topic, writer in writers.items()
+        if isinstance(writer, VideoFile) and writer.left_out
+    ]
+    by_file: dict[Path, int] = {}
+    for topic, number in written.items():
+        by_file[out / files[topic]] = by_file.get(out / files[topic], 0) + number
+    return ExportReport(by_file, recording.losses, remarks)
+
+
+def _choose(recording: Recording, to: Format, patterns: Collection[str] | None) -> dict[str, TopicSummary]:
+    there = {name: found for name, found in recording.topics.items() if found.count}
+    if to in ("images", "video"):
+        there = {name: found for name, found in there.items() if found.sample_type is Frame}
+    chosen = {
+        name: found
+        for name, found in there.items()
+        if patterns is None or any(fnmatchcase(name, pattern) for pattern in patterns)
+    }
+    unknown = [p for p in patterns or () if not any(fnmatchcase(name, p) for name in there)]
+    if unknown or not chosen:
+        what = (
+            "no frames"
+            if to in ("images", "video") and not there
+            else f"nothing on {', '.join(unknown) or 'any topic'}"
+        )
+        raise UnsupportedError(
+            f"{recording.file} holds {what} to export to {to}",
+            remedy=f"name some of {', '.join(there)}" if there else "`microdrivers info` tells what a file holds",
+        )
+    return chosen
+
+
+def _maker(
+    recording: Recording,
+    to: Format,
+    stage: Path,
+    files: Mapping[str, str],
+    names: Mapping[str, str],
+    start: int,
+    stack: ExitStack,
+    topics: list[str],
+) -> Callable[[str, TopicSummary], TopicWriter]:
+    """What makes the writer of a topic."""
+    if to == "csv":
+        return lambda topic, found: CsvTopic(stage / files[topic], found.sample_type, start_ns=start)
+    if to == "parquet":
+        return lambda topic, found: ParquetTopic(stage / files[topic], found.sample_type, topic=topic, start_ns=start)
+    if to == "images":
+        return lambda topic, _: ImageFolder(stage / files[topic], track_of(recording, topic), start_ns=start)
+    if to == "video":
+        return lambda topic, found: VideoFile(stage / files[topic], rate_hz=found.rate_hz)
+    file = Hdf5File(stage / files[topics[0]], recording, start_ns=start)
+    stack.callback(file.close)
+    widths = text_widths(recording, topics)
+    return lambda topic, found: file.topic(names[topic], topic, found.sample_type, widths.get(topic, {}))
+
+
+def _light(sample: Sample) -> Sample:
+    """Tables hold no images: none need be kept until a batch is full."""
+    return without_image(sample) if isinstance(sample, Frame) else sample

@@ -1,0 +1,145 @@
+"""How fast recordings are replayed and analysed, beside what must be reached.
+
+    python scripts/bench_replay.py [--recordings 200] [--folder DIR]
+
+Replay is measured in CPU time, so that other programs on the machine do not count. The batch needs two free cores: the
+load of the machine is shown with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from microdrivers.configs import shipped_rig
+from microdrivers.core.clock import SimulatedClock
+from microdrivers.recording.header import describe_recording
+from microdrivers.recording.playback import open_replay
+from microdrivers.recording.reader import Recording
+from microdrivers.recording.recorder import Recorder
+from microdrivers.rig import open_rig
+from microdrivers.routines.analysis import find_recordings
+from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsReplay, calibrate_optics
+
+FRAMES = 60
+
+
+def record(file: Path, *, seed: int) -> float:
+    """Record an emulated calibration; seconds of recorded time."""
+    clock = SimulatedClock()
+    with open_rig(shipped_rig(), fake=True, seed=seed, clock=clock, devices="microscope") as rig:
+        source = CircleExperiment(rig, CircleSettings(frames=FRAMES))
+        with Recorder(file, bus=rig.bus, clock=clock, header=describe_recording(source="fake", seed=seed)) as recorder:
+            calibrate_optics(source, on_host=lambda name, inbox: recorder.follow_arrivals(name, inbox.arrivals))
+    return span_s(file)
+
+
+def span_s(file: Path) -> float:
+    """From the first to the last frame: between routines' waits, what a camera has seen in real time."""
+    with Recording(file) as recording:
+        ends = [(topic.first_t_ns, topic.last_t_ns) for topic in recording.topics.values() if topic.count]
+    return (max(last for _, last in ends) - min(first for first, _ in ends)) / 1e9
+
+
+def tracking_s(file: Path) -> float:
+    """CPU seconds of a replay with tracker and estimator."""
+    begin = time.process_time()
+    with Recording(file) as recording:
+        calibrate_optics(OpticsReplay(recording))
+    return time.process_time() - begin
+
+
+def publishing_s(file: Path, leave_out: tuple[str, ...]) -> float:
+    """CPU seconds of publishing the recording."""
+    begin = time.process_time()
+    with open_replay(file, leave_out=leave_out) as playback:
+        playback.run()
+    return time.process_time() - begin
+
+
+def minute(file: Path, seconds: float) -> None:
+    """1 kHz force, three stages and a camera of an emulated workstation."""
+    command = ["record", str(shipped_rig("workstation")), "--fake", "--for", str(seconds), "--out", str(file)]
+    subprocess.run([sys.executable, "-m", "microdrivers", *command], check=True, capture_output=True)
+
+
+def analyse(folder: Path, table: Path, jobs: int) -> float:
+    """Wall seconds of the command."""
+    begin = time.monotonic()
+    command = ["analyse", str(folder), "--jobs", str(jobs), "--out", str(table)]
+    subprocess.run([sys.executable, "-m", "microdrivers", *command], check=True, capture_output=True)
+    return time.monotonic() - begin
+
+
+def killed_and_resumed(folder: Path, table: Path) -> bool:
+    """Whether it was killed in the middle; then goes on to the end."""
+    journal = table.with_name(f"{table.name}.journal")
+    command = [sys.executable, "-m", "microdrivers", "analyse", str(folder), "--jobs", "2", "--out", str(table)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wanted = 1 + len(find_recordings([folder])) // 2
+    while process.poll() is None and (not journal.exists() or len(journal.read_bytes().splitlines()) <= wanted):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    in_the_middle = journal.exists()
+    analyse(folder, table, 2)
+    return in_the_middle
+
+
+def main() -> int:
+    """Print the table; exit status 1 if a figure falls short."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=20)
+    parser.add_argument("--folder", type=Path)
+    arguments = parser.parse_args()
+    rows: list[tuple[str, str, str, bool]] = []
+    with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
+        folder = Path(name)
+        file = folder / "optics.mcap"
+        recorded_s = record(file, seed=1)
+        tracking_s(file)
+        factor = recorded_s / min(tracking_s(file) for _ in range(3))
+        rows.append((f"replay with tracking, {FRAMES} frames", "≥ 20 ×", f"{factor:.0f} ×", factor >= 20))
+        dense = folder / "minute.mcap"
+        minute(dense, arguments.seconds)
+        factor = span_s(dense) / min(publishing_s(dense, ("camera*",)) for _ in range(2))
+        rows.append(("replay without frames, 1 kHz force, stages", "≥ 100 ×", f"{factor:.0f} ×", factor >= 100))
+        factor = span_s(dense) / publishing_s(dense, ())
+        rows.append(("replay with frames, no tracking", "≥ 20 ×", f"{factor:.0f} ×", factor >= 20))
+        dense.unlink()
+        runs = folder / "runs"
+        runs.mkdir()
+        for number in range(arguments.recordings):
+            (runs / f"{number:03d}.mcap").hardlink_to(file)
+        one_s, two_s = analyse(runs, folder / "1.csv", 1), analyse(runs, folder / "2.csv", 2)
+        what = f"{arguments.recordings} recordings, --jobs 2 against --jobs 1"
+        load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        told = f"{one_s / two_s:.2f} × ({one_s:.1f} s, {two_s:.1f} s; {load})"
+        rows.append((what, "≥ 1.7 ×", told, one_s / two_s >= 1.7))
+        middle = killed_and_resumed(runs, folder / "3.csv")
+        tables = {(folder / f"{number}.csv").read_bytes() for number in (1, 2, 3)}
+        rows.append(
+            (
+                "tables of 1 and 2 jobs, killed and resumed",
+                "identical",
+                "identical" if len(tables) == 1 else "different",
+                len(tables) == 1,
+            )
+        )
+        rows.append(("  it was killed in the middle", "yes", "yes" if middle else "no", middle))
+    width = max(len(row[0]) for row in rows)
+    print(f"{'figure':<{width}} | must reach | measured")
+    for figure, must, measured, reached in rows:
+        print(f"{figure:<{width}} | {must:<10} | {measured}{'' if reached else '   <-- falls short'}")
+    return 0 if all(reached for *_, reached in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,177 @@
+"""What is exported is what was recorded: to the bit in tables and HDF5, to the pixel in images."""
+
+import csv
+import math
+import sys
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from microdrivers.core.errors import ConfigError, UnsupportedError
+from microdrivers.core.samples import Frame, OpticsTruth
+from microdrivers.recording.export import export_recording
+from microdrivers.recording.export.pictures import eight_bit
+from microdrivers.recording.export.target import file_names
+from microdrivers.recording.image_sequence import ImageSequence
+from microdrivers.recording.reader import Recording
+
+
+@pytest.fixture
+def exported(recorded, tmp_path):
+    def call(to, **options):
+        with Recording(recorded.file) as recording:
+            return export_recording(recording, to, tmp_path / "out", **options)
+
+    return call
+
+
+def samples(recorded, topic):
+    return [sample for name, sample in recorded.published if name == topic]
+
+
+def test_csv(exported, recorded, tmp_path):
+    seen = []
+    report = exported("csv", on_progress=lambda done, total: seen.append((done, total)))
+    assert report.written == {tmp_path / "out" / "force.csv": 500, tmp_path / "out" / "camera.csv": 10}
+    assert seen[-1] == (510, 510)
+    with (tmp_path / "out" / "force.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0])[:3] == ["time_s", "t_ns", "device"]
+    assert [float(row["force_uN"]) for row in rows] == [s.force_uN for s in samples(recorded, "force")]
+    assert [int(row["t_ns"]) for row in rows] == [s.t_ns for s in samples(recorded, "force")]
+    with (tmp_path / "out" / "camera.csv").open() as stream:
+        assert next(csv.DictReader(stream))["principal_point_px_1"] == "nan"
+
+
+def test_parquet(exported, recorded, tmp_path):
+    exported("parquet")
+    table = parquet.read_table(tmp_path / "out" / "force.parquet")
+    assert table["force_uN"].to_pylist() == [s.force_uN for s in samples(recorded, "force")]
+    assert table.schema.field("force_uN").metadata[b"unit"] == b"uN"
+    assert table.schema.metadata[b"topic"] == b"force"
+
+
+def test_hdf5(exported, recorded, tmp_path):
+    exported("hdf5")
+    frames = samples(recorded, "camera")
+    with h5py.File(tmp_path / "out" / "run.h5") as file:
+        assert file.attrs["seed"] == 3
+        assert file["attachments/rig.yaml"][()].tobytes() == b"name: test\n"
+        force = file["force/force_uN"]
+        assert force[()].tolist() == [s.force_uN for s in samples(recorded, "force")]
+        assert (force.attrs["units"], force.chunks is not None) == ("uN", True)
+        assert file["force/t_source"][0] == b"device"
+        images = file["camera/image"]
+        assert images.dtype == np.uint8
+        assert np.array_equal(images, [frame.image for frame in frames])
+        assert file["camera/frame_id"][()].tolist() == [frame.frame_id for frame in frames]
+
+
+def test_hdf5_of_frames_that_change_and_tuples_of_any_length(stage, tmp_path):
+    with stage.recorder():
+        stage.frame(0)
+        stage.frame(1, shape=(20, 30), dtype=np.uint16)
+        for number, corners in enumerate([(1.0, 2.0), (3.0, 4.0), ()]):
+            stage.publish(
+                "truth/optics",
+                OpticsTruth(
+                    t_ns=number, device="µ" * 5 * number, frame_seq=0, x_um=0.0, y_um=0.0, theta_deg=0.0,
+                    corners_px=corners, jacobian_px_per_um=(1.0, 2.0, 3.0, 4.0), scale_px_per_um=1.0, angle_deg=0.0,
+                    mirrored=True, zoom=1.0, tilt_deg=math.nan, flags=frozenset({"B", "A"}),
+                ),
+            )  # fmt: skip
+    export_recording(Recording(stage.file), "hdf5", tmp_path / "out")
+    with h5py.File(tmp_path / "out" / "run.h5") as file:
+        assert file["camera/image"].shape == (1, 40, 60)
+        assert (file["camera/image_2"].shape, file["camera/image_2"].dtype) == ((1, 20, 30), np.uint16)
+        assert file["camera/image_2"].attrs["first_sample"] == 1
+        truth = file["truth-optics"]
+        assert [row.tolist() for row in truth["corners_px"]] == [[1.0, 2.0], [3.0, 4.0], []]
+        assert truth["jacobian_px_per_um"].shape == (3, 4)
+        assert truth["device"].asstr()[2] == "µ" * 10
+        assert truth["flags"].asstr()[0] == "A B"
+        assert truth["mirrored"][()].tolist() == [1, 1, 1]
+    export_recording(Recording(stage.file), "csv", tmp_path / "csv")
+    with (tmp_path / "csv" / "truth-optics.csv").open() as stream:
+        assert [row["corners_px"] for row in csv.DictReader(stream)] == ["1.0 2.0", "3.0 4.0", ""]
+    export_recording(Recording(stage.file), "parquet", tmp_path / "parquet")
+    table = parquet.read_table(tmp_path / "parquet" / "truth-optics.parquet")
+    assert table["corners_px"].to_pylist() == [[1.0, 2.0], [3.0, 4.0], []]
+    report = export_recording(Recording(stage.file), "video", tmp_path / "video")
+    assert "1 frames of another size" in report.remarks[0]
+
+
+def test_images_are_a_sequence_again(optics_recording, tmp_path):
+    with Recording(optics_recording) as recording:
+        export_recording(recording, "images", tmp_path / "out")
+        sequence = ImageSequence(tmp_path / "out" / "camera")
+        published = {name: [s for _, s in recording.samples([name])] for name in ("camera", "stage", "zoom")}
+    assert len(sequence) == 30
+    assert [(row.x_um, row.y_um) for row in sequence.rows] == [(s.x_um, s.y_um) for s in published["stage"]]
+    assert [row.zoom for row in sequence.rows] == [s.zoom for s in published["zoom"]]
+    for row, frame in zip(sequence.rows, published["camera"], strict=True):
+        assert np.array_equal(sequence.load(row), frame.image)
+
+
+def test_a_video_shows_what_was_recorded(optics_recording, tmp_path):
+    with Recording(optics_recording) as recording:
+        export_recording(recording, "video", tmp_path)
+        frames = [frame for _, frame in recording.samples(["camera"])]
+    video = cv2.VideoCapture(str(tmp_path / "camera.avi"))
+    for frame in frames:
+        read, image = video.read()
+        assert read
+        assert np.abs(image[:, :, 0].astype(float) - frame.image).mean() < 3
+    assert not video.read()[0]
+    video.release()
+
+
+def test_video(exported, tmp_path):
+    exported("video")
+    video = cv2.VideoCapture(str(tmp_path / "out" / "camera.avi"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 10
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20, rel=0.01)
+    video.release()
+
+
+def test_sixteen_bits_become_the_upper_eight(recorded):
+    image = np.array([[0, 0x0FF0, 0x0FFF]], dtype=np.uint16)
+    frame = Frame(t_ns=0, device="c", image=image, exposure_ms=1.0, frame_id=0, bit_depth=12, principal_point_px=(0, 0))
+    assert eight_bit(frame).tolist() == [[0, 255, 255]]
+
+
+def test_nothing_is_written_over_and_nothing_half_done_stays(exported, tmp_path, monkeypatch):
+    exported("csv", topics=["camera"])
+    before = (tmp_path / "out" / "camera.csv").read_bytes()
+    with pytest.raises(ConfigError, match="never writes over"):
+        exported("csv")
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["camera.csv"]
+    assert (tmp_path / "out" / "camera.csv").read_bytes() == before
+
+    def interrupted(done, total):
+        raise KeyboardInterrupt
+
+    for to in ("parquet", "hdf5", "images", "video"):
+        with pytest.raises(KeyboardInterrupt):
+            exported(to, on_progress=interrupted)
+        assert [file.name for file in (tmp_path / "out").iterdir()] == ["camera.csv"]
+
+
+def test_what_cannot_be_exported_is_told(exported, monkeypatch):
+    with pytest.raises(UnsupportedError, match="nothing on fource"):
+        exported("csv", topics=["force", "fource"])
+    with pytest.raises(UnsupportedError, match="nothing on force"):
+        exported("images", topics=["force"])
+    for to, module in (("parquet", "pyarrow"), ("hdf5", "h5py")):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(UnsupportedError) as caught:
+            exported(to)
+        assert "microdrivers[export]" in caught.value.remedy
+
+
+def test_file_names_are_safe_and_differ():
+    names = file_names(["a/b", "a-b", "A/B", "../x", "", "µ m"])
+    assert list(names.values()) == ["a-b", "a-b-2", "A-B-3", "-x", "topic", "µ_m"]
