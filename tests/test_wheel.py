@@ -52,4 +52,9 @@ def test_the_wheel_calibrates_away_from_the_checkout(wheel, tmp_path):
         [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["calibration.yaml", "report.html", "result.json"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "calibration.yaml",
+        "report.html",
+        "result.json",
+        "run.mcap",
+    ]

@@ -286,7 +286,9 @@ class Port:
             self._call()
 
     def _hand_over(self, now_ns: int) -> None:
-        """The same for the one to whom everything is delivered."""
+        """The same for the one to whom everything is delivered; what nobody takes stays to be read."""
+        if self._take is None:
+            return
         received = self._received
         while received and received[0][0] <= now_ns:
             self._give(received.popleft())

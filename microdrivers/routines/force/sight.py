@@ -106,7 +106,7 @@ class Sight:
             NoContactPatch: nothing ahead of the tip can be tracked.
         """
         assert self._tip is not None
-        patch = contact_patch(frames, self._tip)
+        patch = contact_patch(frames, self._tip, gap_um=contact_ahead_um)
         tracker = DeformationTracker(camera, tip=self._tip, patch=patch, scale=self._scale(self._tip))
         rest = [tracker.update(frame) for frame in frames]
         tracker.set_contact(

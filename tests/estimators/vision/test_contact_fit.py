@@ -34,7 +34,7 @@ def test_neither_noise_of_the_patch_nor_of_the_frame_biases(contact_scenes: Modu
     grey = half.scene.grey(tip_um=30.9, deformation_um=30.9)
     true_px = np.array([-30.9 * 0.4, 0.0])
     errors, z = [], []
-    for _ in range(120):
+    for _ in range(80):
         match = half.patch(frames=frames).refine(half.scene.digitise(grey).image, np.rint(true_px))
         assert match is not None
         errors.append(match.shift - true_px)
