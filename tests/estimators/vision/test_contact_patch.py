@@ -19,12 +19,12 @@ def see_tip(scene: Any) -> TipView:
     return find_moving_tip(frames, travel_um, scale_hint_px_per_um=scene.look.scale_px_per_um)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture  # one a test: its noise then does not depend on which tests ran before
 def scene(contact_scenes: ModuleType) -> Any:
     return contact_scenes.ContactScene(3, **LOOK)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def tip(scene: Any) -> TipView:
     return see_tip(scene)
 
@@ -38,7 +38,7 @@ def assert_refused(reason: str, frames: list[Frame], tip: TipView, **more: float
 
 @pytest.mark.parametrize("gap_um", [0.0, 8.0, 20.0, 60.0])
 def test_the_surface_is_found_ahead_of_the_tip(scene: Any, tip: TipView, gap_um: float) -> None:
-    patch = contact_patch([scene.show(tip_um=-gap_um) for _ in range(2)], tip, depth_um=80.0)
+    patch = contact_patch([scene.show(tip_um=-gap_um) for _ in range(10)], tip, depth_um=80.0)
     assert patch.contact_px == pytest.approx(CONTACT_PX, abs=2.0)
     assert patch.gap_px == pytest.approx(0.4 * gap_um, abs=2.0)
     assert patch.noise_levels == pytest.approx(2.0, rel=0.1)

@@ -55,7 +55,7 @@ class Bench:
         return tracker
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture  # one a test: its noise then does not depend on which tests ran before
 def bench(contact_scenes: ModuleType) -> Bench:
     return Bench(contact_scenes, count=9)
 
