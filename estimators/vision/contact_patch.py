@@ -62,8 +62,8 @@ class ContactPatch(NamedTuple):
         patch: the pixels; a shift of zero is the undeformed specimen.
         contact_px: where the tip will touch the surface, (u, v) from the centre of the top-left pixel; right within
             2 px.
-        gap_px: from the tip's front to the surface in the last of the frames; by sight right within 2 px from ten frames
-            of a sharp surface.
+        gap_px: from the tip's front to the surface in the last of the frames; by sight right within 2 px from ten
+            frames of a sharp surface.
         tip_shift: shift of the tip's patch in the last of the frames, px.
         reach_px: radius about the contact point in which the patch lies.
         noise_levels: standard deviation of a frame's noise, grey levels.
