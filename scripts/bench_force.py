@@ -2,7 +2,8 @@
 
     python scripts/bench_force.py [--share 1.0] [--workers 2]
 
-Takes about six minutes on two quiet cores; `--share 0.1` runs a tenth of the records. See bench_force/ for how.
+Takes four minutes on two quiet cores. `--share 0.1` runs a tenth of the records: too few to judge intervals and
+efficiency by. See bench_force/ for how.
 """
 
 import os

@@ -10,7 +10,7 @@ from microdrivers.estimators.force.prepared import Indices, Prepared
 from microdrivers.estimators.force.protocols import Fit
 from microdrivers.estimators.force.trajectory import Trajectory, trajectory
 
-_WITHIN_NOISE = 0.2
+_WITHIN_NOISE = 0.35
 """Excess of a residual's variance over the noise's that is none."""
 
 _CLEAR = 5.0

@@ -216,9 +216,11 @@ def _at_all_samples(prepared: Prepared, fit: Fit, motion: Motion) -> Array:
 def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
     if "single" not in protocols:
         return "loading"
-    names: tuple[ProtocolName, ...] = ("single", "unloading_springs", "loading_only", "slip_corrected")
-    fitting: tuple[ProtocolName, ...] = ("single", "unloading_springs", "slip_corrected")
-    within = [name for name in fitting if protocols[name].within_noise]
+    names: list[ProtocolName] = ["single", "unloading_springs", "loading_only"]
+    if not {"slip", "slip_rate"} & set(protocols["slip_corrected"].weak):
+        names.append("slip_corrected")
+    # `loading_only` explains both branches no better than the protocols that look at both.
+    within: list[ProtocolName] = [n for n in names if protocols[n].within_noise and n != "loading_only"]
     if within:
         return min(within, key=lambda name: protocols[name].likelihood_cost)
     least = min(protocols[name].error_percent for name in names)

@@ -20,6 +20,9 @@ LOADING, HOLD, UNLOADING = 0, 1, 2
 """Numbers of the branches in contact."""
 
 _FEWEST_IN_FIT = 10
+_NOISE_SCATTER = 5.0
+"""Three relative standard deviations of an observed noise, times the root of the number of samples."""
+
 _SHORTEST_BASELINE = 15
 _LARGEST_SHARE = 0.2
 """Of a branch's samples: what may be left out at either end."""
@@ -181,10 +184,10 @@ def _noise(stated: float, values: Array) -> float:
     """Stated noise, unless more of it is seen; a trace of the values' range where there is none at all."""
     stated = stated if np.isfinite(stated) else 0.0
     observed = white_sigma(values)
-    # The observation itself scatters by some percent: only what is clearly more overrules a statement.
-    if np.isfinite(observed) and observed > 1.2 * stated:
-        return max(observed, 1e-9 * float(np.ptp(values)))
-    return max(stated, 1e-9 * float(np.ptp(values)))
+    # The observation itself scatters: only what is clearly more overrules a statement.
+    clearly = 1.0 + _NOISE_SCATTER / np.sqrt(len(values))
+    found = observed if np.isfinite(observed) and observed > clearly * stated else stated
+    return float(max(found, 1e-9 * np.ptp(values)))
 
 
 def _mask(n: int, part: range) -> npt.NDArray[np.bool_]:
@@ -266,7 +269,7 @@ def _contact(
     few = force[loading.start : loading.start + 6]
     rise = max(float(few[-1] - few[0]) / (frame_s * max(len(few) - 1, 1)), 1e-12)
     early, late = last - min(6.0 * sigma_f / rise, 5.0 * frame_s), first
-    contact_s, sigma_s = (early + late) / 2.0, float((late - early) / np.sqrt(12.0))
+    contact_s, sigma_s = float(early + late) / 2.0, float(late - early) / float(np.sqrt(12.0))
     stop = max(branches.approach.stop - around, 2)
     level, sigma, slope, _ = _line(time_s, deformation, max(stop - _TIP_SAMPLES, 0), stop, contact_s, sigma_x)
     if abs(slope) > _MOVES * usual:
