@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from bench_wires.figures import Figure, Times
 
@@ -13,38 +14,60 @@ from microdrivers.backends.canopen.sdo import SdoClient
 from microdrivers.backends.lines.can_line import shared_can_line
 from microdrivers.devices.fine_stage import FineStage
 
-_ROUNDS = 40
-_IN_A_ROUND = 200
+_ROUNDS = 300
+_IN_A_ROUND = 20
+_STREAM_HZ = 100.0
 _MOST_SDO_US, _MOST_POSE_US = 50.0, 100.0
 
 
 def measure(repeat: float) -> list[Figure]:
-    """Rounds of SDO reads and of `stage.read()`, in turn; the best round decides, as others disturb whole rounds."""
+    """Short rounds of each, in turn; the best round decides, for others disturb whole rounds."""
     with simulated(STAGE, seed=1) as rig:
         stage = rig.device(STAGE, FineStage)
         bring_home(stage)
-        settings = rig.devices[STAGE]._settings  # type: ignore[attr-defined]
-        line = shared_can_line(settings.connection, clock=rig.clock)
+        settings: Any = rig.description.devices[STAGE].settings
+        medium = {"interface": "microdrivers", "channel": f"socketcan:{settings.connection.channel}"}
+        line = shared_can_line(settings.connection.model_copy(update=medium), clock=rig.clock)
         sdo = SdoClient(line, settings.axes.x.node_id, timeout_s=0.3, name="x")
-        calls: dict[str, Callable[[], object]] = {"SDO": lambda: sdo.read(DEVICE_TYPE), "pose": stage.read}
-        found: dict[str, list[list[int]]] = {name: [] for name in calls}
-        for _ in range(round(_ROUNDS * repeat) + 2):
-            for name, call in calls.items():
-                found[name].append(_round(call))
-    sdo_times, pose_times = (Times(*found[name][1:]) for name in calls)
+        poses: list[object] = []
+        stage.topic.subscribe(poses.append)
+
+        def stream() -> None:
+            rig.clock.sleep(1 / _STREAM_HZ)
+
+        rounds = round(_ROUNDS * repeat) + 2
+        scale = _in_rounds({"loop": _loop}, rounds)["loop"]
+        asked = _in_rounds({"SDO": lambda: sdo.read(DEVICE_TYPE), "pose": stage.read}, rounds)
+        poses.clear()
+        with stage.stream(_STREAM_HZ):
+            streamed = _in_rounds({"pose": stream}, rounds)["pose"]
+        assert len(poses) >= rounds * _IN_A_ROUND
     return [
-        _figure("SDO read of 4 bytes, in process", sdo_times, _MOST_SDO_US),
-        _figure("pose of three axes, from SYNC to sample, in process", pose_times, _MOST_POSE_US),
+        Figure("a Python loop of 1000 turns, for scale", "", f"{scale.best_us:.1f} µs in the best round"),
+        _figure("SDO read of 4 bytes, in process", asked["SDO"], _MOST_SDO_US),
+        _figure("pose of three axes in process, SYNC to sample: asked for", asked["pose"], _MOST_POSE_US),
+        _figure("  in a stream, all that happens between two poses", streamed, _MOST_POSE_US),
     ]
 
 
-def _round(call: Callable[[], object]) -> list[int]:
-    times = []
-    for _ in range(_IN_A_ROUND):
-        begun_ns = time.perf_counter_ns()
-        call()
-        times.append(time.perf_counter_ns() - begun_ns)
-    return times
+def _loop() -> None:
+    total = 0
+    for number in range(1000):
+        total += number * number % 7
+
+
+def _in_rounds(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, Times]:
+    """The first round warms up."""
+    found: dict[str, list[list[int]]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            times = []
+            for _ in range(_IN_A_ROUND):
+                begun_ns = time.perf_counter_ns()
+                call()
+                times.append(time.perf_counter_ns() - begun_ns)
+            found[name].append(times)
+    return {name: Times(*times[1:]) for name, times in found.items()}
 
 
 def _figure(name: str, times: Times, most_us: float) -> Figure:

@@ -40,11 +40,11 @@ def run(job: Job, cache: Cache) -> int:
         environment = {"TMPDIR": str(_memory_folder(job, session)), "LD_PRELOAD": str(cache.uml_preload)}
         if job.virtual_time:
             environment["VCAN_RUN_SKIP_IDLE"] = "1"
-        os.sched_setaffinity(0, {_idlest_processor()})
+        os.sched_setaffinity(0, {idlest_processor()})
         return session.run(machine, environment)
 
 
-def _idlest_processor() -> int:
+def idlest_processor() -> int:
     """Where the guest, which has one processor, is to stay.
 
     Its kernel and its programs are processes that hand over to each other at each system call: on two processors of the

@@ -7,7 +7,7 @@
  * not in Debian's kernel.)
  *
  * So the guest's clock counts real time only while the guest waits, and not beyond what it waits for. While it works,
- * it reads the clock with each system call or switch of threads, every 10 to 50 us. Of that 5 us are counted, about
+ * it reads the clock with each system call or switch of threads, every 10 to 50 us. Of that 1 us is counted, about
  * what a processor of its own would take: the rest is the host's doing, or User Mode Linux's, or a program's that
  * computes. The timers that wake the guest are the host's and may now come early; the guest then sets them again.
  *
@@ -20,7 +20,7 @@
 #include <time.h>
 
 #define NS_PER_S 1000000000LL
-#define MOST_AT_ONCE_NS 5000LL
+#define MOST_AT_ONCE_NS 1000LL
 #define NEVER_NS -1LL
 
 static volatile long long guest_ns, read_ns, wake_ns = NEVER_NS; /* the latter two in real time */

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts.vcan_run import native
+from scripts.vcan_run import native, uml
 from scripts.vcan_run.cli import main
 from scripts.vcan_run.job import GuestFailed, Job, NotUsable
 from scripts.vcan_run.kernel_modules import ModuleTree
@@ -74,6 +74,25 @@ def test_only_root_can_install_qemu(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(NotUsable, match=r"only root can install it: sudo apt-get install .*qemu-system-x86"):
         set_up_qemu(Cache())
+
+
+def test_without_a_network_the_remedy_is_named(monkeypatch, tmp_path):
+    tools, cache = tmp_path / "tools", tmp_path / "cache"
+    tools.mkdir()
+    for tool in ("apt-get", "dpkg-deb"):
+        (tools / tool).write_text("#!/bin/sh\necho 'Temporary failure resolving' >&2\nexit 100\n")
+        (tools / tool).chmod(0o755)
+    done = run_tool("--setup", "uml", MICRODRIVERS_VM_CACHE=str(cache), PATH=str(tools))
+    assert done.returncode == 2
+    assert "Temporary failure resolving" in done.stderr
+    told = done.stderr.splitlines()[-1]
+    assert "apt cannot download busybox-static" in told
+    assert f"without a network, copy the folder {cache}" in told
+    assert not cache.exists() or not list(cache.iterdir())
+
+
+def test_a_guest_stays_on_one_of_the_processors_that_we_may_use():
+    assert uml.idlest_processor() in os.sched_getaffinity(0)
 
 
 def test_the_cache_lies_where_the_environment_says(monkeypatch, tmp_path):
