@@ -42,7 +42,7 @@ class PdosMissing(LinkTimeout):
 
 
 class _Round(msgspec.Struct):
-    """The answers to one SYNC, as far as they have come: by identifier."""
+    """The answers to one SYNC, as far as they have come: by identifier, in the order of their arrival."""
 
     pulse: Pulse
     wanted: bool
@@ -274,7 +274,7 @@ class SyncedPdos:
 
     def _give_out(self, complete: _Round) -> None:
         frames = tuple([complete.frames[cob_id] for cob_id in self._cob_ids])
-        t_ns, dt_ns = self._interval(complete.pulse, frames)
+        t_ns, dt_ns = self._interval(complete)
         newest = self._newest = SyncSet(complete.pulse.number, t_ns, dt_ns, frames)
         for flag in self._waiting:
             flag.set()
@@ -282,12 +282,12 @@ class SyncedPdos:
             self.taken += 1
             self._on_set(newest)
 
-    def _interval(self, pulse: Pulse, frames: Sequence[Received]) -> tuple[int, int]:
+    def _interval(self, complete: _Round) -> tuple[int, int]:
         """When the SYNC reached the nodes: not before it can have passed, nor after the first answer has begun."""
-        shortest_ns, earliest_ns = self._line.shortest_ns, pulse.earliest_ns
-        begun_ns = min([frame.t_ns - shortest_ns[len(frame.data)] for frame in frames]) - self._gap_ns
+        first, earliest_ns = next(iter(complete.frames.values())), complete.pulse.earliest_ns
+        begun_ns = first.t_ns - self._line.shortest_ns[len(first.data)] - self._gap_ns
         half_ns = max(0, begun_ns - earliest_ns) // 2
-        return earliest_ns + half_ns, half_ns + min([frame.dt_ns for frame in frames])
+        return earliest_ns + half_ns, half_ns + first.dt_ns
 
     def _discard(self) -> None:
         """Give up what is awaited: from now on nobody knows which SYNC a frame answers."""

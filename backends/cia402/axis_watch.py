@@ -52,6 +52,7 @@ class AxisWatch:
         target: the last commanded one that still holds, in counts.
         braking: it was told to stop, and has not been seen at rest since.
         dropped: the drive has left "operation enabled" although nobody here has told it to.
+        at_fault: whether the last reading shows a fault, or that one is coming.
     """
 
     def __init__(self, *, tolerance: int) -> None:
@@ -60,6 +61,7 @@ class AxisWatch:
         self.target: int | None = None
         self.braking = False
         self.dropped = False
+        self.at_fault = False
         self._tolerance = tolerance
         self._still = max(_STILL_COUNTS, tolerance)
         self._acknowledged = False
@@ -126,6 +128,7 @@ class AxisWatch:
         if self._enabled and not holds and state is not None:
             self.dropped = True
             self.forget_target()
+        self.at_fault = state in _AT_FAULT
         reached = bool(status_word & _REACHED)
         if holds and self.target is not None and mode == PROFILE_POSITION:
             self.moving = not (reached and self._acknowledged)

@@ -88,12 +88,12 @@ class Guard:
     def examine(self) -> None:
         """Look at the newest readings; whether a fault is known by its code does not matter here."""
         for drive in self.drives.all:
-            reading = drive.reading
-            if reading is None or drive.axis in self._faults:
+            watch, reading = drive.watch, drive.reading
+            if not (watch.at_fault or watch.dropped) or reading is None or drive.axis in self._faults:
                 continue
-            if reading.at_fault:
+            if watch.at_fault:
                 self._note(drive, f"{drive.name} is at fault", 0)
-            elif drive.watch.dropped:
+            else:
                 state = reading.state.value if reading.state else "an unknown state"
                 self._note(drive, f"{drive.name} has left operation enabled by itself: it is in {state}", 0)
 

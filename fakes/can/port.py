@@ -196,10 +196,7 @@ class Port:
         Raises:
             PortError: the port is closed, unplugged or bus-off.
         """
-        while not enough():
-            received = self._await_in_exchange(deadline_ns)
-            if received is None:
-                return
+        while not enough() and (received := self._await_in_exchange(deadline_ns)) is not None:
             self._give(received)
 
     def set_filters(self, filters: Sequence[tuple[int, int, bool | None]]) -> None:

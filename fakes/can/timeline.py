@@ -65,7 +65,7 @@ class BusTimeline:
         self._on_passed = on_passed
         self._nodes: list[CanNode] = []
         self._listens_to: list[Container[int]] = []
-        self._routes: dict[int, list[int]] = {}  # by identifier, whom a frame concerns
+        self._routes: dict[int, list[tuple[int, CanNode]]] = {}  # by identifier, whom a frame concerns
         self._events_ns: list[int] = []
         self._next_node_ns = NEVER_NS
         self._future: list[tuple[int, _Offer]] = []  # heap by time; they compete later
@@ -210,8 +210,7 @@ class BusTimeline:
             concerned = self._routes.get(identifier)
             if concerned is None or self._next_node_ns <= end_ns:
                 concerned = self._concerned(identifier, end_ns)
-            for index in concerned:
-                node = self._nodes[index]
+            for index, node in concerned:
                 if node is not sender:
                     for due in node.receive(frame, end_ns):
                         self.offer(node, due.frame, due.t_ns)
@@ -219,13 +218,16 @@ class BusTimeline:
         if self._waiting or (self._future and self._future[0][0] <= end_ns):
             self._begin(end_ns)
 
-    def _concerned(self, identifier: int, t_ns: int) -> list[int]:
+    def _concerned(self, identifier: int, t_ns: int) -> list[tuple[int, CanNode]]:
         """To whom a frame is to be given: who listens, and who has something to do at that time."""
-        listening = [index for index, container in enumerate(self._listens_to) if identifier in container]
+        all_of_them = list(enumerate(self._nodes))
         if identifier <= _HIGHEST_STANDARD_ID:
-            self._routes[identifier] = listening
-        due = [index for index, event_ns in enumerate(self._events_ns) if event_ns <= t_ns]
-        return sorted({*listening, *due}) if due else listening
+            self._routes[identifier] = [each for each in all_of_them if identifier in self._listens_to[each[0]]]
+        return [
+            (index, node)
+            for index, node in all_of_them
+            if identifier in self._listens_to[index] or self._events_ns[index] <= t_ns
+        ]
 
     def _advance(self, index: int, t_ns: int) -> None:
         node = self._nodes[index]

@@ -284,12 +284,16 @@ class CanOpenNode:
         return server.transfer is not None or not is_upload(request)
 
     def _sync(self, _frame: Frame, t_ns: int) -> bool:
-        self._transmit.at_sync(t_ns)
-        waited, self._set_points_wait = self._set_points_wait, False
-        if waited:
-            for pdo in self._receive:
-                pdo.at_sync(t_ns)
-        return waited
+        for sent in self._transmit.synchronous:
+            data = sent.at_sync(t_ns)
+            if data is not None:
+                self._send(sent.cob_id, data, t_ns)
+        if not self._set_points_wait:
+            return False
+        self._set_points_wait = False
+        for taken in self._receive:
+            taken.at_sync(t_ns)
+        return True
 
     def _taker(self, pdo: ReceivePdo) -> Handler:
         def take(frame: Frame, t_ns: int) -> bool:

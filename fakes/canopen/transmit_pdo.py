@@ -72,8 +72,11 @@ class TransmitPdo(PdoRecord):
 
     def sample(self, t_ns: int) -> bytes:
         """The bytes at `t_ns`."""
-        values = [entry.value if entry.read is None else entry.read(t_ns) for entry in self.mapped if entry is not None]
-        return self.pack(*values)
+        return self.pack(*[entry.value if entry.read is None else entry.read(t_ns) for entry in self._entries])
+
+    def _use(self, cob: int, count: int) -> None:
+        super()._use(cob, count)
+        self._entries = [entry for entry in self.mapped if entry is not None]
 
     @property
     def event_driven(self) -> bool:
@@ -144,6 +147,7 @@ class TransmitPdos:
         changes_are_events: whether a changed value sends an event-driven PDO; else only its timer does.
 
     Attributes:
+        synchronous: those that a SYNC may send.
         cycle_ns: when it is looked next whether something has changed; None if a change sends nothing.
     """
 
@@ -151,7 +155,7 @@ class TransmitPdos:
         self._pdos = pdos
         self._send = send
         self._changes_are_events = changes_are_events
-        self._at_sync: list[TransmitPdo] = []
+        self.synchronous: list[TransmitPdo] = []
         self._by_event: list[TransmitPdo] = []
         self.cycle_ns: int | None = None
         self._running = False
@@ -166,23 +170,16 @@ class TransmitPdos:
     def stop(self) -> None:
         """It is so no longer."""
         self._running = False
-        self._at_sync, self._by_event, self.cycle_ns = [], [], None
+        self.synchronous, self._by_event, self.cycle_ns = [], [], None
 
     def sort(self, t_ns: int) -> None:
         """A PDO has been set to something else."""
         if not self._running:
             return
         valid = [pdo for pdo in self._pdos if pdo.valid and pdo.mapped]
-        self._at_sync = [pdo for pdo in valid if not pdo.event_driven]
+        self.synchronous = [pdo for pdo in valid if not pdo.event_driven]
         self._by_event = [pdo for pdo in valid if pdo.event_driven]
         self.cycle_ns = t_ns + CYCLE_NS if self._by_event and self._changes_are_events else None
-
-    def at_sync(self, t_ns: int) -> None:
-        """A SYNC has ended: values of this instant are sent."""
-        for pdo in self._at_sync:
-            data = pdo.at_sync(t_ns)
-            if data is not None:
-                self._send(pdo.cob_id, data, t_ns)
 
     def look(self, t_ns: int) -> None:
         """Something may have changed."""
