@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import Annotated, Literal
 
 import pydantic
 
 from microdrivers.devices.drivers import DeviceSettings
+from microdrivers.devices.frame_sources import known_schemes
 
 _Pixels = Annotated[int, pydantic.Field(gt=0, le=20_000)]
 
@@ -30,7 +32,7 @@ class CameraDeviceSettings(DeviceSettings):
     """
 
     driver: Literal["camera"] = "camera"
-    source: str = pydantic.Field(pattern=r"^[a-z0-9+]+://")
+    source: str
     sensor_size_px: tuple[_Pixels, _Pixels]
     view: Literal["top", "lateral"] = "top"
     pixel_pitch_um: float = pydantic.Field(gt=0, le=100)
@@ -40,6 +42,17 @@ class CameraDeviceSettings(DeviceSettings):
     gain: float = pydantic.Field(default=1.0, gt=0)
     arrival_delay_ms: float = pydantic.Field(default=20.0, ge=0)
     arrival_uncertainty_ms: float = pydantic.Field(default=20.0, gt=0)
+
+    @pydantic.field_validator("source")
+    @classmethod
+    def _of_a_known_kind(cls, source: str) -> str:
+        scheme, separator, _ = source.partition("://")
+        known = known_schemes()
+        if not separator or scheme not in known:
+            close = difflib.get_close_matches(scheme, known, n=1) if separator else []
+            hint = f"did you mean {close[0]}://?" if close else f"begin it with one of {', '.join(known)}, then ://"
+            raise ValueError(f"source {source!r} names no installed frame source; {hint}")
+        return source
 
     @pydantic.model_validator(mode="after")
     def _exposure_fits(self) -> CameraDeviceSettings:

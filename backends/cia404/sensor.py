@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from microdrivers.backends.canopen.aborts import SdoAbort
@@ -105,11 +105,14 @@ class Cia404ForceSensor(ForceSensor):
         self.fault = None
 
     def _identify(self) -> DeviceInfo:
-        self._background.append(self._line.service(Heartbeats).produce(_HEARTBEAT_MS / 1000))
-        return self._set_up()
+        heartbeats = self._line.service(Heartbeats)
+        interval_s = _HEARTBEAT_MS / 1000
+        self._background.append(heartbeats.produce(interval_s))
+        return self._set_up(before=lambda: heartbeats.refuse_other_host(interval_s))
 
-    def _set_up(self) -> DeviceInfo:
+    def _set_up(self, before: Callable[[], object] = lambda: None) -> DeviceInfo:
         info = self._amplifier.identify()
+        before()
         self._amplifier.prepare()
         sends_heartbeat(self._node, interval_ms=_HEARTBEAT_MS, timeout_s=_HEARTBEATS_TIMEOUT_S)
         self._has_forgotten = False

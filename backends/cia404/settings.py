@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 import pydantic
@@ -23,12 +24,13 @@ class Cia404ForceSettings(ForceSensorSettings):
     """A force sensor on one channel of an amplifier.
 
     With `sync` the amplifier sends on each SYNC, together with all devices that do; else by its own event timer, which
-    counts whole milliseconds. `conversion_ms` is how long the amplifier takes to renew its value.
+    counts whole milliseconds. `conversion_ms` is how long the amplifier takes to renew its value. Node 127 is
+    this computer.
     """
 
     driver: Literal["cia404-force"] = "cia404-force"
     connection: CanConnection
-    node_id: int = pydantic.Field(ge=1, le=127)
+    node_id: int = pydantic.Field(ge=1, le=126)
     channel: int = pydantic.Field(default=1, ge=int(CHANNELS.min), le=int(CHANNELS.max))
     rate_hz: float = pydantic.Field(default=FASTEST_HZ, gt=0, le=FASTEST_HZ)
     sync: bool = False
@@ -51,4 +53,8 @@ class Cia404ForceSettings(ForceSensorSettings):
 
     def claims(self) -> tuple[str, ...]:
         """The node."""
-        return (f"node {self.node_id} on {self.connection.interface}:{self.connection.channel}",)
+        return (f"node {self.node_id} on {self.connection.place}",)
+
+    def shares(self) -> Mapping[str, Mapping[str, object]]:
+        """The bus."""
+        return self.connection.shared()

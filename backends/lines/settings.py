@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import difflib
+import math
+from collections.abc import Collection, Mapping
+from typing import Any, Literal
 
 import pydantic
 
@@ -43,3 +46,77 @@ class CanConnection(DeviceSettings):
     timeout_s: float = pydantic.Field(default=0.3, gt=0, le=30)
     arrival_uncertainty_ms: float = pydantic.Field(default=1.0, gt=0, le=100)
     options: dict[str, bool | int | float | str] = pydantic.Field(default_factory=dict)
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _options_in_their_place(cls, section: Any) -> Any:
+        for key in section if isinstance(section, dict) else ():
+            if key not in cls.model_fields and not difflib.get_close_matches(key, cls.model_fields, n=1):
+                raise ValueError(
+                    f"{key} is no key of a CAN connection; if it is an option of python-can's interface, write "
+                    f"options: {{{key}: …}}"
+                )
+        return section
+
+    @pydantic.field_validator("interface")
+    @classmethod
+    def _known_to_python_can(cls, interface: str) -> str:
+        known = _interfaces()
+        if known and interface not in known:
+            close = difflib.get_close_matches(interface, known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"it knows {', '.join(sorted(known))}"
+            raise ValueError(
+                f"python-can knows no interface {interface!r}; {hint} (what else there is comes with a plug-in: "
+                "install it)"
+            )
+        return interface
+
+    @pydantic.field_validator("options", mode="before")
+    @classmethod
+    def _plain(cls, options: Any) -> Any:
+        for key, value in options.items() if isinstance(options, dict) else ():
+            if key in cls.model_fields:
+                raise ValueError(f"options.{key} is not python-can's affair; write it beside options, not in it")
+            if key == "fd" and not isinstance(value, bool):
+                raise ValueError(f"options.fd is {value!r}; write true for CAN FD or false for classic CAN")
+            if not isinstance(value, bool | int | float | str) or value != value or value in (math.inf, -math.inf):
+                raise ValueError(f"options.{key} is {value!r}; write true, false, a number or text")
+        return options
+
+    @pydantic.model_validator(mode="after")
+    def _channel_of_the_interface(self) -> CanConnection:
+        channel = self.channel
+        if self.interface == "slcan" and "/" not in channel and not channel.upper().startswith("COM"):
+            raise ValueError(f"channel {channel!r} is no serial port, as slcan needs; write one, as /dev/ttyACM0")
+        if self.interface == "socketcan" and ("/" in channel or len(channel) > _LONGEST_NAME):
+            raise ValueError(
+                f"channel {channel!r} is no name of a network interface; write one as can0, or interface: slcan for an "
+                "adapter on a serial port"
+            )
+        return self
+
+    @property
+    def place(self) -> str:
+        """The bus in words; nodes on it have their own."""
+        return f"{self.interface}:{self.channel}"
+
+    def shared(self) -> Mapping[str, Mapping[str, object]]:
+        """The bus, as `DeviceSettings.shares` has it of each device there; a serial adapter's is a port."""
+        path = self.channel.partition("@")[0]
+        name = f"port {path}" if path.startswith(("/", "COM", "socket://")) else f"CAN bus {self.place}"
+        return {name: {f"connection.{key}": getattr(self, key) for key in _ALIKE}}
+
+
+_LONGEST_NAME = 15
+"""Of a Linux network interface (IFNAMSIZ), in characters."""
+
+_ALIKE = ("interface", "channel", "bitrate", "options")
+
+
+def _interfaces() -> Collection[str]:
+    """python-can's own interfaces and those of plug-ins; none if it is not installed, which opening says."""
+    try:
+        from can.interfaces import VALID_INTERFACES
+    except ModuleNotFoundError:
+        return ()
+    return VALID_INTERFACES

@@ -35,7 +35,7 @@ _REPORT = "driver and controller disagree about the command language: check that
 _AXIS = "compare the axis ids in the rig file with the answer to SAI?"
 _PARAMETERS = "check the controller's stage parameters (PIMikroMove), then clear_fault()"
 _SERVO = "check load, obstacles, servo parameters and cable, then clear_fault()"
-_EMERGENCY = "release the emergency stop once the way is free, then clear_fault() and reference the axes"
+_EMERGENCY = "release the emergency stop once the way is free, then clear_fault() and reference()"
 _WAIT = "wait until the controller has finished, then try again"
 _SWITCH = "choose another reference mode (FRF, FNL, FPL) for this axis in the rig file"
 
@@ -45,7 +45,7 @@ _MEANINGS: dict[int, _Meaning] = {
     3: _Meaning(ProtocolError, "command too long or buffer overrun", _REPORT),
     5: _Meaning(
         NotReferenced, "unallowed move: axis not referenced or servo off",
-        "make sure that the way is free, then reference() the axis",
+        "make sure that the way is free, then reference()",
     ),
     7: _Meaning(OutOfRange, "position out of limits", "choose a target between TMN? and TMX?"),
     8: _Meaning(OutOfRange, "velocity out of limits", "lower the maximum speed of the axis in the rig file"),
@@ -67,7 +67,7 @@ _MEANINGS: dict[int, _Meaning] = {
     34: _Meaning(UnsupportedError, "command not allowed for this stage", _PARAMETERS),
     45: _Meaning(DeviceFault, "referencing failed", _SERVO),
     49: _Meaning(DeviceFault, "move to the limit switch failed", _SERVO),
-    50: _Meaning(DeviceFault, "reference move while the reference mode is off", "reference() the axis again"),
+    50: _Meaning(DeviceFault, "reference move while the reference mode is off", "once more reference()"),
     51: _Meaning(BusyError, "the axis is under joystick control", "switch the joystick off"),
     53: _Meaning(BusyError, "a dynamic move is in process", _WAIT),
     54: _Meaning(ProtocolError, "unknown parameter", _REPORT),

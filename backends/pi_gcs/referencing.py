@@ -107,5 +107,5 @@ class ReferenceSearch:
     def _stopped(self) -> MoveCancelled:
         return MoveCancelled(
             f"the reference move of axis {self._axis} was stopped",
-            remedy="check why the stop was requested, then reference the axis again",
+            remedy=f"check why the stop was requested, then reference([{self._axis!r}])",
         )

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import pydantic
 
 from microdrivers.backends.lines.settings import SerialConnection
 from microdrivers.core.units import Range
-from microdrivers.devices.drivers import DeviceSettings
+from microdrivers.devices.drivers import DeviceSettings, spelled
 
 ReferenceMode = Literal["FRF", "FNL", "FPL"]
+
+_MOST_AXES = {"C-884.4": 4, "C-884": 6, "C-863": 1}
+"""By what a model's name begins with; ids that are numbers are those of its connectors."""
+_NATIVE_ONLY = "C-863.10"
+
+
+AxisId = Annotated[str, spelled(r"^[A-Za-z0-9_]{1,16}\Z", "an axis id has 1 to 16 letters, digits and _")]
 
 
 class _Axis(DeviceSettings):
@@ -21,7 +29,7 @@ class _Axis(DeviceSettings):
     daisy chain (DIP switches 1-4), which may have to have a `serial_number`.
     """
 
-    id: str = pydantic.Field(default="1", pattern=r"^[A-Za-z0-9_]{1,16}$")
+    id: AxisId = "1"
     address: int | None = pydantic.Field(default=None, ge=1, le=16)
     serial_number: str | None = None
     stage: str | None = None
@@ -77,7 +85,10 @@ class StageAxes(DeviceSettings):
         addresses = [axis.address for axis in axes]
         if None not in addresses:
             if len(set(addresses)) != len(axes):
-                raise ValueError(f"the three controllers of a daisy chain need different addresses, not {addresses}")
+                raise ValueError(
+                    f"{_twice(addresses)}.address is that of another axis: the three controllers of a daisy chain need "
+                    f"different addresses, not {addresses}"
+                )
             return self
         if any(addresses):
             raise ValueError(
@@ -86,7 +97,9 @@ class StageAxes(DeviceSettings):
             )
         ids = [axis.id for axis in axes]
         if len(set(ids)) != len(ids):
-            raise ValueError(f"the three axes need different controller axis ids, not {ids}")
+            raise ValueError(
+                f"{_twice(ids)}.id is that of another axis: the three need different controller axis ids, not {ids}"
+            )
         if any(axis.serial_number is not None for axis in axes):
             raise ValueError("only an axis with an address has a serial_number: give it for the stage, not per axis")
         return self
@@ -111,12 +124,35 @@ class GcsStageSettings(DeviceSettings):
 
     driver: Literal["pi-gcs-xytheta"] = "pi-gcs-xytheta"
     connection: SerialConnection
-    controller: str = "C-884"
+    controller: str = pydantic.Field(default="C-884", min_length=1)
     serial_number: str | None = None
     axes: StageAxes
     latch: PositionLatch = PositionLatch()
     settle_s: float = pydantic.Field(default=0.2, gt=0)
     reference_timeout_s: float = pydantic.Field(default=60.0, gt=0)
+
+    @pydantic.model_validator(mode="after")
+    def _axes_of_the_controller(self) -> GcsStageSettings:
+        if self.controller.startswith(_NATIVE_ONLY):
+            raise ValueError(
+                f"controller {self.controller} speaks no GCS on its serial line; use a C-863.11 or C-863.12, or a C-884"
+            )
+        most = next((number for family, number in _MOST_AXES.items() if self.controller.startswith(family)), None)
+        if most is None:
+            return self
+        axes = {"x": self.axes.x, "y": self.axes.y, "theta": self.axes.theta}
+        if not self.axes.chained and most < len(axes):
+            raise ValueError(
+                f"controller {self.controller} drives one axis; give each axis the address of its own controller in "
+                "the daisy chain, address: 1, 2, 3, or correct the controller"
+            )
+        for name, axis in axes.items():
+            if axis.id.isdecimal() and not 1 <= int(axis.id) <= most:
+                raise ValueError(
+                    f"axes.{name}.id {axis.id!r} is none of a {self.controller}, whose axes are 1 to {most}; correct "
+                    "it, or state the controller's full name if it has more axes"
+                )
+        return self
 
     @pydantic.model_validator(mode="after")
     def _whose_serial_number(self) -> GcsStageSettings:
@@ -129,6 +165,11 @@ class GcsStageSettings(DeviceSettings):
     def claims(self) -> tuple[str, ...]:
         """The port."""
         return (f"port {self.connection.port}",)
+
+
+def _twice(values: Sequence[object]) -> str:
+    """The axis whose value another one before it has too."""
+    return next(axis for i, axis in enumerate(("x", "y", "theta")) if values[i] in values[:i])
 
 
 def _check(travel: Range, resolution: float, tolerance: float, unit: str) -> None:

@@ -5,19 +5,28 @@ from __future__ import annotations
 import contextlib
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
-from microdrivers.cli.output import RECORDING, describe_recorded, describe_rig, prepare_folder, start_recording
+from microdrivers.cli.output import (
+    RecordingChoice,
+    describe_recorded,
+    describe_rig,
+    prepare_folder,
+    recorded_as,
+    recording_options,
+    start_recording,
+    tell_flaws,
+)
 from microdrivers.cli.progress import TerminalProgress
-from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
+from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 
 if TYPE_CHECKING:
     from microdrivers.core.inbox import Inbox
+    from microdrivers.recording.recorder import Recorder
     from microdrivers.routines.optics.source import OpticsSource
 
 
@@ -28,7 +37,7 @@ if TYPE_CHECKING:
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option("--images", type=click.Path(path_type=Path), help="Folder with frames.csv: a recorded image sequence.")
 @click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimator on what it recorded.")
-@click.option("--record/--no-record", default=True, show_default=True, help="Record all samples in run.mcap.")
+@recording_options
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-optics/.")
 @click.option("--radius-um", type=float, help="Radius of the circle; default: up to 300, as large as fits the view.")
 @click.option("--zoom-to", type=float, default=1.2, show_default=True, help="Zoom after the change.")
@@ -45,7 +54,7 @@ def optics(
     world: Path | None,
     images: Path | None,
     replay: Path | None,
-    record: bool,
+    recording: RecordingChoice | None,
     out: Path | None,
     radius_um: float | None,
     zoom_to: float,
@@ -94,7 +103,7 @@ def optics(
                 "settled": settled,
             }
             choice = RigChoice(rig_file or shipped_rig(), fake or rig_file is None, seed, world, wire_log)
-            complete = _on_rig(choice, out, circle, real_time, as_json, progress, record=record)
+            complete = _on_rig(choice, out, circle, real_time, as_json, progress, recording=recording)
     finally:
         progress.close()
     if not complete:
@@ -116,8 +125,7 @@ def _from_recording(file: Path, out: Path | None, as_json: bool, progress: Termi
     from microdrivers.routines.optics import OpticsReplay
 
     with Recording(file) as recording:
-        for loss in recording.losses:
-            progress.step(f"not readable: {loss}")
+        tell_flaws(recording)
         return _run(OpticsReplay(recording), describe_recorded(recording), out, as_json, progress)
 
 
@@ -129,7 +137,7 @@ def _on_rig(
     as_json: bool,
     progress: TerminalProgress,
     *,
-    record: bool,
+    recording: RecordingChoice | None,
 ) -> bool:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
@@ -137,12 +145,15 @@ def _on_rig(
 
     file, fake, seed, world, wire_log, _ = choice
     clock = SimulatedClock() if fake and not real_time else SystemClock()
-    with open_rig(
-        file, fake=fake, seed=seed or 0, clock=clock, world=world, devices="microscope", wire_log=wire_log
-    ) as rig:
+    with (
+        saying_commands(file),
+        open_rig(
+            file, fake=fake, seed=seed or 0, clock=clock, world=world, devices="microscope", wire_log=wire_log
+        ) as rig,
+    ):
         settings = CircleSettings(**circle)
         provenance = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict())
-        return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress, record=record)
+        return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress, recording=recording)
 
 
 def _run(
@@ -152,7 +163,7 @@ def _run(
     as_json: bool,
     progress: TerminalProgress,
     *,
-    record: bool = False,
+    recording: RecordingChoice | None = None,
 ) -> bool:
     from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import CalibrationError
@@ -165,11 +176,17 @@ def _run(
 
     folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics")
     truth = OpticsTruthCollector(source.bus)
+    recorder: Recorder | None = None
+
+    def follow(name: str, inbox: Inbox) -> None:
+        if recorder is not None:
+            recorder.follow_arrivals(name, inbox.arrivals)
+
     with contextlib.ExitStack() as stack:
-        follow: Callable[[str, Inbox], object] = lambda _name, _inbox: None  # noqa: E731
-        if record:
-            recorder = stack.enter_context(start_recording(folder, bus=source.bus, clock=source.clock, known=known))
-            follow = lambda name, inbox: recorder.follow_arrivals(name, inbox.arrivals)  # noqa: E731
+        if recording is not None:
+            recorder = stack.enter_context(
+                start_recording(folder, recording, bus=source.bus, clock=source.clock, known=known)
+            )
         run = calibrate_optics(source, progress=progress, on_host=follow)
     if not run.estimates and not run.complete:
         click.echo("nothing had been measured yet", err=True)
@@ -194,6 +211,5 @@ def _run(
         click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
     else:
         click.echo(optics_summary(result))
-        recorded = f", {RECORDING}" if record else ""
-        click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html{recorded}")
+        click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html{recorded_as(recorder)}")
     return run.complete

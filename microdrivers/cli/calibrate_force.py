@@ -5,20 +5,32 @@ from __future__ import annotations
 import contextlib
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
-from microdrivers.cli.output import RECORDING, describe_recorded, describe_rig, prepare_folder, start_recording
+from microdrivers.cli.output import (
+    RecordingChoice,
+    describe_recorded,
+    describe_rig,
+    prepare_folder,
+    recorded_as,
+    recording_options,
+    start_recording,
+    tell_flaws,
+)
 from microdrivers.cli.progress import TerminalProgress
-from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice
+from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 
 if TYPE_CHECKING:
     from microdrivers.core.inbox import Inbox
-    from microdrivers.routines.force import Characterisation, IndentationSource
+    from microdrivers.recording.recorder import Recorder
+    from microdrivers.report.force_truth import ContactTruthCollector
+    from microdrivers.results.force import ForceResult
+    from microdrivers.routines.force import Characterisation, ForceRun, IndentationSource
 
 _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else in its way?"
 
@@ -31,7 +43,7 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
 @click.option("--specimen", metavar="NAME", help="Preset of an emulated specimen; on hardware, a name for the result.")
 @click.option("--csv", "table", type=click.Path(path_type=Path), help="A recorded indentation instead of a rig.")
 @click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimators on what it recorded.")
-@click.option("--record/--no-record", default=True, show_default=True, help="Record all samples in run.mcap.")
+@recording_options
 @click.option("--calibration", type=click.Path(path_type=Path), help="result.json of `calibrate optics` for µm.")
 @click.option("--depth-um", type=float, default=110.0, show_default=True, help="How far to press.")
 @click.option("--max-force-uN", "max_force_uN", type=float, help="Where to turn back; default: 80 % of the limit.")
@@ -51,7 +63,7 @@ def force(
     specimen: str | None,
     table: Path | None,
     replay: Path | None,
-    record: bool,
+    recording: RecordingChoice | None,
     calibration: Path | None,
     yes: bool,
     check: bool,
@@ -94,8 +106,9 @@ def force(
             overrides = {"specimen": {"preset": specimen}} if emulated and specimen is not None else None
             choice = RigChoice(rig_file or shipped_rig(), emulated, seed, world, wire_log)
             complete = _on_rig(
-                choice, specimen, overrides, calibration, press, check, out, real_time, as_json, progress, record=record
-            )
+                choice, specimen, overrides, calibration, press, check, out, real_time, as_json, progress,
+                recording=recording,
+            )  # fmt: skip
     finally:
         progress.close()
     if not complete:
@@ -122,8 +135,7 @@ def _from_recording(file: Path, check: bool, out: Path | None, as_json: bool, pr
     from microdrivers.routines.force import IndentationReplay
 
     with Recording(file) as recording:
-        for loss in recording.losses:
-            progress.step(f"not readable: {loss}")
+        tell_flaws(recording)
         return _run(IndentationReplay(recording), describe_recorded(recording), check, out, as_json, progress)
 
 
@@ -147,7 +159,7 @@ def _on_rig(
     as_json: bool,
     progress: TerminalProgress,
     *,
-    record: bool,
+    recording: RecordingChoice | None,
 ) -> bool:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
@@ -155,14 +167,33 @@ def _on_rig(
 
     file, fake, seed, world, wire_log, _ = choice
     clock = SimulatedClock() if fake and not real_time else SystemClock()
-    with open_rig(
-        file, fake=fake, seed=seed or 0, clock=clock, world=world, world_overrides=overrides, devices="probe",
-        wire_log=wire_log,
-    ) as rig:  # fmt: skip
+    with (
+        saying_commands(file),
+        _naming_the_option(),
+        open_rig(
+            file, fake=fake, seed=seed or 0, clock=clock, world=world, world_overrides=overrides, devices="probe",
+            wire_log=wire_log,
+        ) as rig,
+    ):  # fmt: skip
         settings = PressSettings(**press)
         sight = Sight.calibrated(rig, calibration) if calibration is not None else Sight()
         known = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict() | {"specimen": specimen})
-        return _run(PressExperiment(rig, settings, sight=sight), known, check, out, as_json, progress, record=record)
+        source = PressExperiment(rig, settings, sight=sight)
+        return _run(source, known, check, out, as_json, progress, recording=recording)
+
+
+@contextlib.contextmanager
+def _naming_the_option() -> Iterator[None]:
+    """What is wrong with the preset of the specimen is wrong with the option that names it."""
+    from microdrivers.core.errors import ConfigError
+    from microdrivers.rig.simulation import OVERRIDES
+
+    try:
+        yield
+    except ConfigError as error:
+        if (error.file, error.key) == (OVERRIDES, "specimen.preset"):
+            error.file, error.key = "--specimen", ""
+        raise
 
 
 def _run(
@@ -173,56 +204,80 @@ def _run(
     as_json: bool,
     progress: TerminalProgress,
     *,
-    record: bool = False,
+    recording: RecordingChoice | None = None,
 ) -> bool:
     from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import MicrodriversError
-    from microdrivers.report.force_report import write_force_report
     from microdrivers.report.force_summary import force_summary
     from microdrivers.report.force_truth import ContactTruthCollector
-    from microdrivers.routines.force import Characterisation, build_result
-    from microdrivers.routines.provenance import describe_run
+    from microdrivers.routines.force import Characterisation
 
     folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force")
     truth = ContactTruthCollector(source.bus)
+    recorder: Recorder | None = None
+
+    def follow(name: str, inbox: Inbox) -> None:
+        if recorder is not None:
+            recorder.follow_arrivals(name, inbox.arrivals)
+
     with contextlib.ExitStack() as stack:
-        follow: Callable[[str, Inbox], object] = lambda _name, _inbox: None  # noqa: E731
-        if record:
-            recorder = stack.enter_context(start_recording(folder, bus=source.bus, clock=source.clock, known=known))
-            follow = lambda name, inbox: recorder.follow_arrivals(name, inbox.arrivals)  # noqa: E731
+        if recording is not None:
+            recorder = stack.enter_context(
+                start_recording(folder, recording, bus=source.bus, clock=source.clock, known=known)
+            )
         characterisation = Characterisation(source, on_host=follow)
         try:
             run = characterisation.run(progress, check=check)
-        except MicrodriversError:
-            _keep(characterisation, folder)
+        except MicrodriversError as error:
+            if known["clock"] != "recorded":
+                _keep(characterisation, folder)
+            partial = characterisation.partial(error)
+            if partial is not None:
+                _write(partial, known, truth, folder, progress)
+                click.echo(f"what it says of the specimen is in {folder}/: result.json, report.html", err=True)
+            if characterisation.interrupted:
+                raise KeyboardInterrupt from error
             raise
+    result = _write(run, known, truth, folder, progress)
+    _keep(characterisation, folder, say=False)
+    if as_json:
+        click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
+    else:
+        click.echo(force_summary(result))
+        files = f"result.json, specimen.yaml, record.csv, report.html{recorded_as(recorder)}"
+        click.echo(f"\nwritten to {folder}/: {files}")
+    return run.complete
+
+
+def _write(
+    run: ForceRun, known: dict[str, Any], truth: ContactTruthCollector, folder: Path, progress: TerminalProgress
+) -> ForceResult:
+    """Write result.json, specimen.yaml and report.html."""
+    from microdrivers.core.clock import utc_now
+    from microdrivers.report.force_report import write_force_report
+    from microdrivers.routines.force import build_result
+    from microdrivers.routines.provenance import describe_run
+
     command = shlex.join(["microdrivers", *sys.argv[1:]])
     result = build_result(run, describe_run(known, command=command, now=utc_now()))
     result = result.model_copy(update={"truth": truth.compare(result, run.first.deformations)})
     folder.mkdir(parents=True, exist_ok=True)
     result.write_json(folder / "result.json")
     result.write_specimen(folder / "specimen.yaml")
-    _keep(characterisation, folder, say=False)
     progress.step("drawing the report")
     write_force_report(result, folder / "report.html")
     progress.close()
-    if as_json:
-        click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
-    else:
-        click.echo(force_summary(result))
-        recorded = f", {RECORDING}" if record else ""
-        click.echo(f"\nwritten to {folder}/: result.json, specimen.yaml, record.csv, report.html{recorded}")
-    return run.complete
+    return result
 
 
 def _keep(characterisation: Characterisation, folder: Path, *, say: bool = True) -> None:
     """Write down what has been measured, also of an experiment that failed."""
     from microdrivers.recording.indentation_table import write_indentation_table
 
-    if characterisation.first is None or not characterisation.first.samples:
+    if characterisation.first is None or not characterisation.first.frames:
         return
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "record.csv"
-    write_indentation_table(file, characterisation.first.samples)
+    write_indentation_table(file, characterisation.first.frames)
     if say:
         click.echo(f"what was measured is in {file}; to analyse it: calibrate force --csv {file}", err=True)

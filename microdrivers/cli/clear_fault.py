@@ -32,6 +32,7 @@ def clear_fault(choice: RigChoice, device: str, yes: bool) -> None:
     from microdrivers.devices.force_sensor import ForceSensor
     from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
+    from microdrivers.routines.commands import as_commands
     from microdrivers.routines.device_state import state_text
 
     with closing(choice.build()) as rig:
@@ -45,7 +46,7 @@ def clear_fault(choice: RigChoice, device: str, yes: bool) -> None:
             return
         click.echo(f"{found.name}: {click.style('FAULT', fg='red', bold=True)}: {fault.what}")
         if fault.remedy:
-            click.echo(f"  to do: {fault.remedy}")
+            click.echo(f"  to do: {as_commands(fault.remedy, choice.file, found.name)}")
         if not (yes or rig.fake or rig.file.emulated):
             click.confirm("Is its cause removed, and is the way free?", abort=True, err=True)
         found.clear_fault()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
+from microdrivers.cli.output import tell_flaws
 from microdrivers.cli.progress import TerminalProgress
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ def export(file: Path, to: str, topics: tuple[str, ...], out: Path | None) -> No
     progress = TerminalProgress()
     try:
         with Recording(file) as recording:
+            tell_flaws(recording)
             progress.step(f"reading {file}")
             report = export_recording(
                 recording, cast("Format", to), out or file.with_name(f"{file.stem}-export"), topics=patterns,
@@ -56,5 +58,3 @@ def export(file: Path, to: str, topics: tuple[str, ...], out: Path | None) -> No
         click.echo("a video loses detail and exact times: look at it, measure in the recording")
     for remark in report.remarks:
         click.echo(remark, err=True)
-    for loss in report.losses:
-        click.echo(f"not readable, and not exported: {loss}", err=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import click
 from microdrivers.cli.rig_options import RigChoice, find_device, rig_options
 
 if TYPE_CHECKING:
+    from microdrivers.devices.fine_stage import FineStage
     from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
     from microdrivers.rig import Rig
@@ -62,7 +64,10 @@ def move(choice: RigChoice, device: str, relative: bool, retract: bool, **option
                 click.echo(f"{device}: {state_text(stage_or_zoom, stage_or_zoom.move_to(zoom=zoom))}")
             else:
                 _reference_emulated(rig, stage_or_zoom, given)
-                click.echo(f"{device}: {_move_stage(stage_or_zoom, given, relative)}")
+                if retract:
+                    _retract(stage_or_zoom)
+                else:
+                    click.echo(f"{device}: {_move_stage(stage_or_zoom, given, relative)}")
         except NotReferenced as error:
             error.remedy = f"make sure that the way is free, then: {_reference_command(choice, stage_or_zoom, given)}"
             raise
@@ -118,16 +123,37 @@ def _move_stage(stage: Stage[Any], given: dict[str, float], relative: bool) -> s
     from microdrivers.routines.device_state import state_text
 
     moving: Any = stage  # which keywords its own move takes has been checked
-    if not given:
-        pose = moving.retract().wait()
-    elif relative:
+    if relative:
         pose = moving.move_by(**{name if "speed" in name else f"d{name}": value for name, value in given.items()})
     else:
         pose = moving.move_to(**given)
     here, goal = pose.position, pose.target
-    axes = _axes(given) or [axis for axis in here if goal[axis] == goal[axis]]
-    misses = [f"{axis} {here[axis] - goal[axis]:+.3g} {stage.axes[axis].unit}" for axis in axes]
+    misses = [f"{axis} {here[axis] - goal[axis]:+.3g} {stage.axes[axis].unit}" for axis in _axes(given)]
     return f"{state_text(stage, pose)}; off target by {', '.join(misses)}"
+
+
+def _retract(stage: FineStage) -> None:
+    """Take the tool away, and say how far that was.
+
+    Raises:
+        NotReached: not the whole way that the rig file states.
+    """
+    from microdrivers.core.errors import NotReached
+    from microdrivers.routines.device_state import state_text
+
+    start = stage.read().position
+    pose = stage.retract().wait()
+    way = dict(zip(stage.axis_names, stage.retract_um or (), strict=True))
+    asked_um = math.hypot(*way.values())
+    moved_um = sum((pose.position[axis] - start[axis]) * length for axis, length in way.items()) / asked_um
+    click.echo(f"{stage.name}: {state_text(stage, pose)}; taken away by {moved_um:.2f} µm of {asked_um:g} µm")
+    if stage.retraction_share < 1.0 and asked_um - moved_um > max(stage.axes[axis].tolerance for axis in way):
+        raise NotReached(
+            "the tool is not taken away as far as retract_um says: the travel ends, or a keep-out box begins",
+            device=stage.name,
+            moved="no" if stage.retraction_share == 0.0 else "yes",
+            remedy="look whether the tool is clear; else move it away on another axis, or state a shorter retract_um",
+        )
 
 
 def _reference_command(choice: RigChoice, device: Stage[Any] | ZoomMotor, given: dict[str, float]) -> str:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from microdrivers.cli.main import EXIT_ERROR
+from microdrivers.cli.output import COMPRESSION_HELP
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ _PLAIN_LINE_PERIOD_S = 10.0
     "--out", type=click.Path(path_type=Path), metavar="FILE", help="New file to write; default: RIG-DATE.mcap."
 )
 @click.option("--real-time", is_flag=True, help="Let a simulation take the time that it simulates.")
-@click.option("--compress-images", is_flag=True, help="Without loss; 40 ms a megapixel.")
+@click.option("--compress-images", is_flag=True, help=COMPRESSION_HELP.capitalize())
 @click.option(
     "--on-failure", type=click.Choice(["stop", "go-on"]), default="stop", show_default=True,
     help="What a full disk does: end the recording, or count what is lost and try again.",
@@ -54,6 +56,7 @@ def record(
 
     Force comes at its sensor's rate, frames at their camera's, poses at 100 Hz, the zoom at 70 Hz. The file is
     complete after Ctrl-C, and whatever kills the program costs the last 0.1 s: see `microdrivers recording repair`.
+    If samples could not be written, they are counted, and the exit status is 1.
 
     \b
     Examples:
@@ -97,6 +100,8 @@ def record(
     except KeyboardInterrupt:
         ended_by_user = True
     _tell(recorder, interrupted=ended_by_user)
+    if any(count.dropped for count in recorder.counts.values()):
+        sys.exit(EXIT_ERROR)
 
 
 def _default_file(rig: Rig) -> Path:

@@ -19,17 +19,24 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Find the reference of a stage or the zoom (moves!).")
 @rig_options
-@click.option("--axes", metavar="A,B,…", help="Axes of a stage in the order in which to reference them: x,y,theta.")
+@click.option(
+    "--axes",
+    metavar="A,B,…",
+    help="Axes of a stage in the order in which to reference them: x,y,theta. Default, of a fine stage: as the rig "
+    "file says.",
+)
 @click.option("--device", help="Which stage or zoom; default: the microscope's sample stage.")
 @click.option("--yes", is_flag=True, help="Do not ask whether the way is free.")
 def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool) -> None:
     """Find the reference of a stage or the zoom of the rig file RIG. IT MOVES to its reference switches.
 
-    Asks first whether the way is free. Ctrl-C stops the device. Only that device is opened.
+    Asks first whether the way is free. Ctrl-C stops the device. Only that device is opened. A fine stage is referenced
+    in the order of its reference_order in the rig file, which takes the tool away first.
 
     \b
     Examples:
       microdrivers reference lab.yaml --axes x,y,theta
+      microdrivers reference lab.yaml --device probe_stage
       microdrivers reference lab.yaml --device zoom
     """
     from microdrivers.devices.zoom_motor import ZoomMotor
@@ -40,7 +47,9 @@ def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool
         names = _checked_axes(found, axes)
         found.open()
         if not (yes or rig.fake):
-            click.confirm(f"{found.name} will move to its reference switches. Is the way free?", abort=True, err=True)
+            order = f", {', then '.join(names)}" if names else ""
+            question = f"{found.name} will move to its reference switches{order}. Is the way free?"
+            click.confirm(question, abort=True, err=True)
         progress = TerminalProgress()
         found.events.subscribe(lambda event: _show(event, progress))
         if isinstance(found, ZoomMotor):
@@ -67,8 +76,11 @@ def _find(rig: Rig, choice: RigChoice, name: str | None) -> Stage[Any] | ZoomMot
 def _checked_axes(device: Stage[Any] | ZoomMotor, axes: str | None) -> list[str]:
     """The axes that were named, refused before anything is opened or asked if they are not the device's."""
     from microdrivers.core.errors import OutOfRange, UnsupportedError
+    from microdrivers.devices.fine_stage import FineStage
     from microdrivers.devices.zoom_motor import ZoomMotor
 
+    if axes is None and isinstance(device, FineStage):
+        return list(device.reference_order)
     names = [name.strip() for name in (axes or "").split(",") if name.strip()]
     if isinstance(device, ZoomMotor):
         if axes is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.output import tell_flaws
 from microdrivers.cli.progress import TerminalProgress
 
 
@@ -48,8 +49,7 @@ def replay(file: Path, speed: float | None) -> None:
     interrupted = False
     try:
         with open_replay(file, clock=SimulatedClock() if speed is None else clock) as playback:
-            for loss in playback.recording.losses:
-                progress.step(f"not readable: {loss}")
+            tell_flaws(playback.recording)
             total = sum(found.count for found in playback.recording.topics.values())
             progress.step(f"replaying {file}")
             begin_ns = clock.now_ns()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -75,9 +76,24 @@ def rig_options(command: Callable[..., None]) -> Callable[..., None]:
         wire_replay: Path | None,
         **others: Any,
     ) -> None:
-        command(RigChoice(rig, fake, seed, world, wire_log, wire_replay), **others)
+        with saying_commands(rig):
+            command(RigChoice(rig, fake, seed, world, wire_log, wire_replay), **others)
 
     return with_choice
+
+
+@contextmanager
+def saying_commands(file: Path) -> Iterator[None]:
+    """Whatever fails inside says what to do in commands for the rig in that file."""
+    from microdrivers.core.errors import MicrodriversError
+
+    try:
+        yield
+    except MicrodriversError as error:
+        from microdrivers.routines.commands import name_commands
+
+        name_commands(error, file)
+        raise
 
 
 def find_device(rig: Rig, name: str, kinds: tuple[type[Any], ...], *, unsuitable: str) -> Any:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from microdrivers.rig.serving import ServedRig
 
 _LONGEST_S = 1e9
+_ADAPTER = "slcan"
 
 
 def _finite(_context: click.Context, _parameter: click.Parameter, value: float | None) -> float | None:
@@ -30,7 +31,10 @@ def _finite(_context: click.Context, _parameter: click.Parameter, value: float |
 )
 @click.option("--bind", default="127.0.0.1", show_default=True, help="Address for TCP and HTTP; the default is local.")
 @click.option(
-    "--can", "can_interface", metavar="NAME", help="SocketCAN interface for CAN, as vcan0; default: a serial adapter."
+    "--can",
+    "can_interface",
+    metavar="NAME",
+    help="SocketCAN interface for CAN, as vcan0; default: slcan, a serial adapter.",
 )
 @click.option(
     "--write",
@@ -63,7 +67,8 @@ def serve(
     """Emulate the rig file RIG in real time and let other programs use it.
 
     Serial devices appear on pseudo-terminals or TCP ports, CAN buses behind a serial adapter (slcan) or on a SocketCAN
-    interface, cameras as HTTP streams. Other machines are not let in unless --bind says so.
+    interface, cameras as HTTP streams. Other machines are not let in unless --bind says so. A serial adapter belongs to
+    one program at a time, with all devices on its bus; a SocketCAN interface is shared.
 
     \b
     Examples:
@@ -82,7 +87,7 @@ def serve(
         world=world,
         transport=transport,
         bind=bind,
-        can_interface=can_interface,
+        can_interface=None if can_interface == _ADAPTER else can_interface,
         wire_log=wire_log,
     ) as running:
         try:
@@ -105,6 +110,25 @@ def _announce(running: ServedRig, served: Path | None, duration_s: float | None,
     width = max(map(len, where))
     for name, place in where.items():
         click.echo(f"{name:<{width}}  {place}")
+    for line in _adapters(running):
+        click.echo(line)
     if served is not None:
         click.echo(f"rig file: {served}")
     click.echo("serving; Ctrl-C ends it" if duration_s is None else f"serving for {duration_s:g} s")
+
+
+def _adapters(running: ServedRig) -> list[str]:
+    """How other programs reach the CAN buses behind serial adapters, a line for each."""
+    users: dict[str, list[str]] = {}
+    bitrates: dict[str, int] = {}
+    for name, endpoint in running.endpoints.items():
+        connection = endpoint.overrides.get("connection", {})
+        if connection.get("interface") == _ADAPTER:
+            users.setdefault(connection["channel"], []).append(name)
+            bitrates[connection["channel"]] = connection["bitrate"]
+    return [
+        f"{channel} is a serial CAN adapter: one program at a time has it, with all devices on its bus "
+        f"({', '.join(names)}); it connects with a rig file from --write, or with "
+        f"can.Bus(interface={_ADAPTER!r}, channel={channel!r}, bitrate={bitrates[channel]})"
+        for channel, names in users.items()
+    ]

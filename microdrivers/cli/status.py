@@ -54,7 +54,8 @@ def _ask(device: Device[Any], file: Path) -> dict[str, Any]:
 
     from microdrivers.core.errors import MicrodriversError
     from microdrivers.devices.camera import Camera
-    from microdrivers.routines.device_state import fault_remedy, identity_text, state_data, state_text
+    from microdrivers.routines.commands import as_commands
+    from microdrivers.routines.device_state import identity_text, state_data, state_text
 
     entry: dict[str, Any] = {
         "identity": None, "info": None, "link": "closed", "state": None, "text": "", "fault": None, "fault_remedy": "",
@@ -66,11 +67,12 @@ def _ask(device: Device[Any], file: Path) -> dict[str, Any]:
         sample = None if isinstance(device, Camera) else device.read()
         entry |= {"state": state_data(device, sample), "text": state_text(device, sample)}
     except MicrodriversError as error:
-        remedy = fault_remedy(error, file, device.name) if device.link == "open" else error.remedy
+        remedy = as_commands(error.remedy, file, device.name)
         entry["error"] = {"kind": type(error).__name__, "what": error.what, "remedy": remedy}
     entry["link"] = device.link
     if device.fault is not None:
-        entry |= {"fault": device.fault.what, "fault_remedy": fault_remedy(device.fault, file, device.name)}
+        remedy = as_commands(device.fault.remedy, file, device.name)
+        entry |= {"fault": device.fault.what, "fault_remedy": remedy}
     return entry
 
 

@@ -7,6 +7,7 @@ framework names none of them; a third party's package adds its own. See docs/dec
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -22,13 +23,32 @@ from microdrivers.devices.wire_tap import WireTap
 
 
 class DeviceSettings(pydantic.BaseModel):
-    """Base of a driver's settings in the rig file: unknown keys are refused, values are not converted silently."""
+    """Base of a driver's settings in the rig file: unknown keys are refused, values are not converted silently.
+
+    A validator's `ValueError` is shown with its place in the file. It may begin with the key that it is about, and end
+    with what to do: `travel_um runs backwards; write [lowest, highest]`.
+    """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     def claims(self) -> tuple[str, ...]:
         """What a device needs for itself alone, in words: a port, a node on a bus. A rig gives each to one device."""
         return ()
+
+    def shares(self) -> Mapping[str, Mapping[str, object]]:
+        """What a device uses together with others, in words: settings, by key, that all of them must state alike."""
+        return {}
+
+
+def spelled(pattern: str, words: str) -> pydantic.AfterValidator:
+    """A check of text against a regular expression, with what to say if it does not match."""
+
+    def check(text: str) -> str:
+        if re.search(pattern, text) is None:
+            raise ValueError(words)
+        return text
+
+    return pydantic.AfterValidator(check)
 
 
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)

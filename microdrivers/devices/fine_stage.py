@@ -19,6 +19,15 @@ Vector = tuple[float, float, float]
 _log = logging.getLogger(__name__)
 
 
+def place_of_tip(origin_um: Vector, axes_in_rig: Mapping[str, Vector], position_um: Mapping[str, float]) -> Vector:
+    """Where in the rig's frame a tip is that is at `origin_um` when all axes are at 0."""
+    x, y, z = origin_um
+    for axis, (dx, dy, dz) in axes_in_rig.items():
+        way = position_um[axis]
+        x, y, z = x + way * dx, y + way * dy, z + way * dz
+    return (x, y, z)
+
+
 class FineStage(Stage[FineStageSample]):
     """A 3-DOF fine stage in its own axes x, y, z (µm); see `Stage`.
 
@@ -28,6 +37,7 @@ class FineStage(Stage[FineStageSample]):
             say.
         retract_um: the way, in the stage's own axes, that takes the tool away from the sample; None if the rig file
             states none.
+        retraction_share: how much of `retract_um` was free for the last retraction, 0 to 1.
     """
 
     sample_type = FineStageSample
@@ -39,6 +49,7 @@ class FineStage(Stage[FineStageSample]):
 
     def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
         super().__init__(name, clock=clock, bus=bus)
+        self.retraction_share = 1.0
         self._retraction: Move[FineStageSample] | None = None
         self._begins_retraction = False
 
@@ -62,11 +73,7 @@ class FineStage(Stage[FineStageSample]):
                 device=self.name,
                 remedy="state origin_um: [x, y, z], the tip in the rig's frame when all axes of this stage are at 0",
             )
-        x, y, z = self.origin_um
-        for axis, (dx, dy, dz) in self.axes_in_rig.items():
-            way = position_um[axis]
-            x, y, z = x + way * dx, y + way * dy, z + way * dz
-        return (x, y, z)
+        return place_of_tip(self.origin_um, self.axes_in_rig, position_um)
 
     def move_to(
         self,
@@ -120,7 +127,7 @@ class FineStage(Stage[FineStageSample]):
         """Take the tool away from the sample, as fast as the axes allow: by `retract_um` from where it is.
 
         If the travel ends on the way, or something stands in it, the tool goes as far along the vector as it can, which
-        is logged. No force and no lack of force data keeps it from being taken away.
+        is logged and in `retraction_share`. No force and no lack of force data keeps it from being taken away.
 
         Raises:
             UnsupportedError: the rig file states no way. NotReferenced, LinkLost: nothing has moved.
@@ -146,6 +153,7 @@ class FineStage(Stage[FineStageSample]):
         targets = {axis: here[axis] + share * length for axis, length in way.items()}
         plan = MotionPlan(kind="retraction", start=here, targets=targets, sweep={}, straight=True)
         share *= min((rule.free_share(self, plan) for rule in self.rules), default=1.0)
+        self.retraction_share = share
         if share < 1.0:
             _log.warning("%s: only %.0f %% of retract_um is free", self.name, 100 * share)
         return {

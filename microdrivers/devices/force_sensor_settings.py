@@ -35,6 +35,14 @@ class ForceSensorSettings(DeviceSettings):
             raise ValueError(f"{range_uN} is empty or runs backwards: write [lowest, highest]")
         return range_uN
 
+    @pydantic.model_validator(mode="after")
+    def _finer_than_its_range(self) -> ForceSensorSettings:
+        if self.resolution_uN >= self.range_uN.max - self.range_uN.min:
+            raise ValueError(
+                f"resolution_uN {self.resolution_uN:g} is as coarse as the whole range_uN; check the unit, µN"
+            )
+        return self
+
     @pydantic.field_validator("axis")
     @classmethod
     def _unit_vector(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -18,6 +18,11 @@ def register_frame_source(scheme: str, opener: SourceOpener) -> None:
     _openers[scheme] = opener
 
 
+def known_schemes() -> list[str]:
+    """The schemes that are known at present."""
+    return sorted(_openers)
+
+
 def find_frame_source(url: str, clock: Clock) -> FrameSource:
     """The source behind a URL, closed.
 

@@ -192,7 +192,7 @@ class Move(Generic[SampleT]):
         raise ReferenceLost(
             "the reference was lost during the move; stopped",
             device=self._device,
-            remedy="check the controller's power, make sure that the way is free, then reference again",
+            remedy="check the controller's power, make sure that the way is free, then reference()",
         )
 
     def _stop_if_wrong_way(self, position: Mapping[str, float]) -> None:

@@ -115,6 +115,11 @@ class Stage(Device[PoseT]):
         """When the last move had been commanded, ns; −1 before the first."""
         return self._commanded_ns
 
+    @property
+    def braking_s(self) -> float:
+        """How long it may take to come to rest, were it told to now: from the speeds that were commanded last."""
+        return max(self._fastest.get(name, axis.max_speed) / axis.acceleration for name, axis in self.axes.items())
+
     def reference(self, axes: Sequence[str]) -> None:
         """Find the reference of the named axes, in exactly that order. Moves the stage to its switches.
 
@@ -208,10 +213,11 @@ class Stage(Device[PoseT]):
         for axis, target in targets.items():
             unit = self.axes[axis].unit
             check_range(target, self.limits[axis], what=f"target of axis {axis}", unit=unit, device=self.name)
-        unknown = [axis for axis in targets if not self.referenced[axis]]
+        unknown = [axis for axis in self.reference_order if axis in targets and not self.referenced[axis]]
         if unknown:
             raise NotReferenced(
-                f"the reference of axis {', '.join(unknown)} is not known, so no absolute move is possible",
+                f"the reference of axis {', '.join(unknown)} is not known, so its limits cannot be kept: it moves "
+                "neither to a position nor by a distance",
                 remedy=f"make sure that the way is free, then reference({unknown!r})",
             )
 

@@ -10,13 +10,19 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from microdrivers.core.errors import ConfigError, UnsupportedError
-from microdrivers.devices.base import Device
-from microdrivers.devices.drivers import DeviceSettings, Driver
+from microdrivers.devices.drivers import DeviceSettings, Driver, spelled
+from microdrivers.rig.cross_checks import check_devices_together
 from microdrivers.rig.registry import find_driver, known_drivers
 from microdrivers.rig.safety_section import UNSTATED, SafetyKey, check_safety
-from microdrivers.rig.yaml_file import Document, raise_all, read_document, validate
+from microdrivers.rig.validation import suggest, validate
+from microdrivers.rig.yaml_file import Document, raise_all, read_document
 
-DeviceName = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
+DeviceName = Annotated[
+    str, spelled(r"^[a-z][a-z0-9_]*\Z", "a device's name has small letters, digits and _, and begins with a letter")
+]
+RigName = Annotated[
+    str, spelled(r"^[A-Za-z][A-Za-z0-9_-]*\Z", "a rig's name has letters, digits, _ and -, and begins with a letter")
+]
 
 
 class Frames(DeviceSettings):
@@ -76,7 +82,7 @@ class RigFile(DeviceSettings):
     """
 
     schema_version: Literal[1]
-    name: str = pydantic.Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")
+    name: RigName
     description: str = ""
     emulated: bool = False
     frames: Frames
@@ -156,7 +162,7 @@ def load_rig_file(file: Path) -> RigDescription:
         raise_all(document, errors)
         raise AssertionError("unreachable: a rig that failed validation has errors")
     devices, errors = _load_devices(rig.devices, document)
-    errors += _check_roles(rig, devices, document) + _check_claims(devices, document)
+    errors += check_devices_together(rig, devices, document)
     errors += check_safety(rig, devices, document)
     raise_all(document, errors)
     return RigDescription(file=file, rig=rig, devices=devices)
@@ -167,18 +173,19 @@ def _load_devices(sections: Mapping[str, Any], document: Document) -> tuple[dict
     errors: list[ConfigError] = []
     for name, section in sections.items():
         where = ("devices", name)
-        driver_name = section.get("driver") if isinstance(section, dict) else None
+        if not isinstance(section, dict):
+            continue  # which the whole file's model says
+        driver_name = section.get("driver")
         if not isinstance(driver_name, str):
-            errors.append(
-                document.error("the device names no driver", where, remedy=f"add driver: one of {known_drivers()}")
-            )
+            remedy = f"add driver: one of {', '.join(known_drivers())}"
+            errors.append(document.error("the device names no driver", where, remedy=remedy))
             continue
         driver = find_driver(driver_name)
         if driver is None:
             errors.append(
                 document.error(
                     f"no driver {driver_name!r} is installed", (*where, "driver"),
-                    remedy=f"use one of {', '.join(known_drivers())}, or install the package that provides it",
+                    remedy=f"{suggest(driver_name, known_drivers())} Or install the package that provides it",
                 )
             )  # fmt: skip
             continue
@@ -187,47 +194,3 @@ def _load_devices(sections: Mapping[str, Any], document: Document) -> tuple[dict
         if settings is not None:
             devices[name] = DeviceEntry(name, driver_name, driver, settings)
     return devices, errors
-
-
-def _check_claims(devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:
-    """A port or a node belongs to one device."""
-    owners: dict[str, str] = {}
-    errors = []
-    for name, entry in devices.items():
-        for claim in entry.settings.claims():
-            owner = owners.setdefault(claim, name)
-            if owner != name:
-                errors.append(
-                    document.error(
-                        f"{claim} already belongs to {owner!r}", ("devices", name), remedy="give each device its own"
-                    )
-                )
-    return errors
-
-
-def _check_roles(rig: RigFile, devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:
-    """The devices that the sections `microscope` and `probe` name must exist and be of the right kind."""
-    from microdrivers.devices.camera import Camera
-    from microdrivers.devices.fine_stage import FineStage
-    from microdrivers.devices.force_sensor import ForceSensor
-    from microdrivers.devices.xytheta_stage import XYThetaStage
-    from microdrivers.devices.zoom_motor import ZoomMotor
-
-    sections: dict[str, dict[str, type[Device[Any]]]] = {
-        "microscope": {"sample_stage": XYThetaStage, "zoom": ZoomMotor, "camera": Camera},
-        "probe": {"stage": FineStage, "force": ForceSensor, "camera": Camera},
-    }
-    errors = []
-    for title, roles in sections.items():
-        section = getattr(rig, title)
-        for role, kind in roles.items() if section is not None else ():
-            name, where = getattr(section, role), (title, role)
-            if name not in rig.devices:
-                remedy = f"name one of {', '.join(rig.devices)}"
-                errors.append(document.error(f"there is no device {name!r} in this file", where, remedy=remedy))
-            elif name in devices and not issubclass(devices[name].driver.kind, kind):
-                found = devices[name].driver.kind.__name__
-                errors.append(
-                    document.error(f"{name!r} is a {found}, not a {kind.__name__}", where, remedy="name another device")
-                )
-    return errors

@@ -14,6 +14,7 @@ from microdrivers.devices.base import Device
 from microdrivers.devices.force_sensor import ForceSensor
 
 _FIRST_READING_S = 0.5
+_REMEMBERED_NS = 2 * NS_PER_S
 _WITHOUT_FORCE = "stop() and retract() work all the same"
 
 
@@ -43,6 +44,9 @@ class ForceFlow:
         self._why_not = ""
         self._awaited = False
         self._arrived = clock.event()
+        self._looked_ns = -1
+        self._late_ns = 0
+        self._late_until_ns = -1
 
     # ------------------------------------------------------------------ what comes
 
@@ -66,7 +70,15 @@ class ForceFlow:
         if age_ns <= self._stale_after_ns:
             return ""
         age = f" for {age_ns / NS_PER_MS:.0f} ms" if self._heard_ns >= 0 else ""
-        return f"no reading has come from {self._name}{age}"
+        return f"no reading has come from {self._name}{age}{self._busy}"
+
+    @property
+    def _busy(self) -> str:
+        """What is added if this computer may be to blame."""
+        if self._clock.now_ns() >= self._late_until_ns:
+            return ""
+        late_ms = self._late_ns / NS_PER_MS
+        return f" (this computer is too busy: it looked {late_ms:.0f} ms late; have it do less at once)"
 
     # ------------------------------------------------------------------ seeing to it that it comes
 
@@ -112,7 +124,8 @@ class ForceFlow:
             with ExitStack() as begun:
                 begun.enter_context(sensor.stream(sensor.stream_rate_hz))
                 period_s = self._stale_after_ns / 5 / NS_PER_S
-                begun.callback(self._clock.every(period_s, self._on_beat, name=f"{self._name} guard").cancel)
+                self._looked_ns = -1
+                begun.callback(self._clock.every(period_s, self._beat, name=f"{self._name} guard").cancel)
                 self._kept = begun.pop_all()
         except MicrodriversError as error:
             raise UnsafeError(
@@ -120,6 +133,14 @@ class ForceFlow:
                 device=stage,
                 remedy=f"{error.remedy or f'check {self._name}'}; {_WITHOUT_FORCE}",
             ) from error
+
+    def _beat(self) -> None:
+        now_ns, period_ns = self._clock.now_ns(), self._stale_after_ns // 5
+        late_ns = now_ns - self._looked_ns - period_ns
+        if self._looked_ns >= 0 and late_ns > period_ns:
+            self._late_ns, self._late_until_ns = late_ns, now_ns + _REMEMBERED_NS
+        self._looked_ns = now_ns
+        self._on_beat()
 
     def _await_reading(self) -> None:
         deadline_ns = self._clock.now_ns() + round(_FIRST_READING_S * NS_PER_S)

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import ErrorTree, MicrodriversError, UnsafeError
 from microdrivers.core.samples import ForceSample
-from microdrivers.core.units import NS_PER_MS
+from microdrivers.core.units import NS_PER_MS, seconds_to_ns
 from microdrivers.devices.base import Device
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, STALE
@@ -85,6 +85,7 @@ class ForceGuard:
         self._blind = False
         self._unstopped = False
         self._stopped_ns = -_AGAIN_NS
+        self._braking_until_ns = -1
         self._least_uN = math.inf
         self._doubted_tare_uN = 0.0
 
@@ -112,6 +113,9 @@ class ForceGuard:
             UnsafeError: no valid, fresh force data come.
         """
         if plan.kind == "retraction":
+            self._braking_until_ns = self._clock.now_ns()
+            if not plan.straight:
+                self._braking_until_ns += seconds_to_ns(self._the_stage().braking_s)
             return
         self._flow.require(self.settings.stage)
         self._armed = self._allowed = True
@@ -168,7 +172,7 @@ class ForceGuard:
             return
         self._flow.heard(sample.t_ns)
         if self._is_over(force_uN):
-            self._hold_over_limit(force_uN, sample.t_ns)
+            self._hold_over_limit(force_uN, sample)
         elif self.tripped and abs(force_uN) <= _BELOW_SHARE * self.settings.max_force_uN:
             self._end_trip()
 
@@ -178,6 +182,10 @@ class ForceGuard:
             return math.nan
         if SATURATED in sample.flags:
             return math.inf
+        return self._load_uN(sample)
+
+    def _load_uN(self, sample: ForceSample) -> float:
+        """The raw force less as much of the tare as a zero can be off; of a saturated sensor, where it stands."""
         zero_uN = self.settings.zero_uN
         return sample.raw_uN - min(max(sample.tare_uN, -zero_uN), zero_uN)
 
@@ -186,7 +194,7 @@ class ForceGuard:
 
     # ------------------------------------------------------------------ too much force
 
-    def _hold_over_limit(self, force_uN: float, t_ns: int) -> None:
+    def _hold_over_limit(self, force_uN: float, sample: ForceSample) -> None:
         stage, reason = self._stage, self._excess(force_uN)
         with self._lock:
             is_new, self.tripped = not self.tripped, self.tripped or reason
@@ -194,7 +202,7 @@ class ForceGuard:
         if is_new:
             self._least_uN = math.inf
         if retracting:
-            self._watch_retraction(stage, force_uN, t_ns)
+            self._watch_retraction(stage, force_uN, sample)
         elif is_new:
             self._trip(reason, force_uN, retract=self._armed and stage is not None)
         else:
@@ -218,12 +226,16 @@ class ForceGuard:
         ]
         return [*([own] if own is not None else []), *others]
 
-    def _watch_retraction(self, stage: FineStage | None, force_uN: float, t_ns: int) -> None:
+    def _watch_retraction(self, stage: FineStage | None, force_uN: float, sample: ForceSample) -> None:
         """Stop a retraction that makes it worse; from then on only a person knows what to do."""
-        if stage is None or not stage.retracting or stage.being_commanded or t_ns < stage.commanded_ns:
-            return  # the reading is from before it began, when what had been stopped was still braking
-        self._least_uN = min(self._least_uN, abs(force_uN))
-        if not abs(force_uN) > self._least_uN + _WORSE_SHARE * self.settings.max_force_uN:
+        if stage is None or not stage.retracting or stage.being_commanded:
+            return
+        begun_ns = stage.commanded_ns
+        if begun_ns <= self._stopped_ns or sample.t_ns < max(begun_ns, self._braking_until_ns):
+            return  # it has not been commanded yet, or the reading is of what was still braking
+        load_uN = abs(self._load_uN(sample))
+        self._least_uN = min(self._least_uN, load_uN)
+        if not load_uN > self._least_uN + _WORSE_SHARE * self.settings.max_force_uN:
             return
         self._least_uN = math.inf
         reason = f"retracting raises the force: {self._excess(force_uN)}"

@@ -38,6 +38,7 @@ class KeepOut:
             return
         unknown = [axis for axis, known in stage.referenced.items() if not known]
         if unknown:
+            unknown.sort(key=stage.reference_order.index)
             raise UnsafeError(
                 f"axis {', '.join(unknown)} is not referenced, so it is not known whether the tool would enter a "
                 "keep-out box",

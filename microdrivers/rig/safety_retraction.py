@@ -109,7 +109,9 @@ class Retraction:
             return
         if pose is not None:
             where = ", ".join(f"{axis} {position:.2f} µm" for axis, position in pose.position.items())
-            self._end(f"the tool was taken away, to {where}", succeeded=True)
+            share = stage.retraction_share
+            part = "" if share == 1.0 else f" by {100 * share:.0f} % of retract_um, for no more is free"
+            self._end(f"the tool was taken away{part}, to {where}", succeeded=share > 0.0)
 
     def _end(self, what: str, *, succeeded: bool) -> None:
         with self._lock:

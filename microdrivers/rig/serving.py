@@ -23,6 +23,14 @@ from microdrivers.rig.simulation import Simulation, merge_settings
 _MARK = "served on the endpoints below for as long as the serving process runs."
 """In the first line of every rig file written here: only such a file is overwritten."""
 
+_WHY_PATIENT = (
+    "# heartbeat_ms, timeout_s and stale_after_ms allow for a computer that emulates all this beside other work.\n"
+    "# They are no example for hardware.\n"
+)
+
+_PATIENT_MS = 500.0
+"""How old force readings of an emulated sensor may be: nothing breaks if an emulated stage moves on for so long."""
+
 
 def check_writable(file: Path, served: RigDescription) -> None:
     """Whether a rig file that points at endpoints may be written there; nothing is.
@@ -117,6 +125,9 @@ class ServedRig:
         data = self.description.as_data() | {"emulated": True}
         for name, endpoint in self.endpoints.items():
             data["devices"][name] = merge_settings(data["devices"][name], _plain(endpoint.overrides))
+        if self.description.rig.safety.force_guards:  # else they are `none` in so many words
+            for guard in data["safety"]["force_guards"]:
+                guard["stale_after_ms"] = max(guard["stale_after_ms"], _PATIENT_MS)
         return data
 
     def write(self, file: Path) -> None:
@@ -126,7 +137,7 @@ class ServedRig:
             ConfigError: it may not be written there, see `check_writable`, or cannot be.
         """
         check_writable(file, self.description)
-        header = f"# {self.description.rig.name}, {_MARK}\n"
+        header = f"# {self.description.rig.name}, {_MARK}\n{_WHY_PATIENT}"
         text = header + yaml.safe_dump(self.rig_data(), sort_keys=False, allow_unicode=True)
         try:
             file.write_text(text, encoding="utf-8")

@@ -23,12 +23,14 @@ from microdrivers.devices.drivers import (
 )
 from microdrivers.rig.registry import find_emulator, find_world
 from microdrivers.rig.rig_file import RigDescription
-from microdrivers.rig.yaml_file import Document, raise_all, read_document, validate
+from microdrivers.rig.validation import validate
+from microdrivers.rig.yaml_file import Document, raise_all, read_document
 
 DEFAULT_WORLD = "microscope"
 REPLAY_WORLD = "wire-log"
 _DEFAULT_FILE = Path("default world")
-_OVERRIDES = "world_overrides"
+OVERRIDES = "world_overrides"
+"""Stands for the file in errors about `world_overrides`."""
 
 
 class Simulation:
@@ -127,7 +129,7 @@ class Simulation:
             if part not in value:
                 return error
             value = value[part]
-        return ConfigError(error.what, remedy=error.remedy, file=_OVERRIDES, key=error.key)
+        return ConfigError(error.what, remedy=error.remedy, file=OVERRIDES, key=error.key)
 
 
 def _replay_of(wire_log: Path) -> Document:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 
 from microdrivers.core.errors import MicrodriversError
 from microdrivers.devices.base import DeviceInfo
+from microdrivers.routines.commands import as_commands
 
 Level = Literal["ok", "warning", "problem"]
 
@@ -42,6 +44,12 @@ class Found(msgspec.Struct, kw_only=True):
     def failed(self, error: MicrodriversError, doing: str = "") -> None:
         """An error as a problem."""
         self.problem(f"{doing}: {error.what}" if doing else error.what, error.remedy)
+
+    def say_commands(self, file: Path) -> None:
+        """Say the remedies in the commands of the terminal, for the rig in that file."""
+        self.findings = [
+            msgspec.structs.replace(each, remedy=as_commands(each.remedy, file, self.name)) for each in self.findings
+        ]
 
     def judge(self, good: bool, what: str, remedy: str) -> None:
         """OK or a warning."""

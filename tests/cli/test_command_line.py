@@ -96,25 +96,40 @@ def test_the_default_run_writes_result_calibration_and_report(run, tmp_path):
     assert "https://" not in report
 
 
-def test_json_goes_to_standard_output_alone(tmp_path):
+SHORT = ("calibrate", "optics", "--frames", "60", "--no-record", "--out", "out")
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory):
+    """A short run with seed 5 in a process of its own: what it printed, and its folder."""
+    folder = tmp_path_factory.mktemp("elsewhere")
     ran = subprocess.run(
-        [sys.executable, "-m", "microdrivers", "calibrate", "optics", "--json", "--frames", "60", "--out", "out"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
+        [sys.executable, "-m", "microdrivers", *SHORT, "--seed", "5", "--json"],
+        cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
+    return ran, folder / "out"
+
+
+@pytest.mark.xdist_group("a process of its own")
+def test_json_goes_to_standard_output_alone(elsewhere):
+    ran, _ = elsewhere
     assert ran.returncode == 0, ran.stderr
     assert json.loads(ran.stdout)["kind"] == "optical-calibration"
 
 
-def test_a_seed_gives_the_same_bits_twice_and_another_seed_others(run, tmp_path):
-    def bits(seed, folder):
-        assert run("calibrate", "optics", "--seed", seed, "--frames", "60", "--out", folder).exit_code == 0
-        data = json.loads((tmp_path / folder / "result.json").read_text())
+@pytest.mark.xdist_group("a process of its own")
+def test_a_seed_gives_the_same_bits_twice_and_another_seed_others(run, tmp_path, elsewhere):
+    def bits(folder):
+        data = json.loads((folder / "result.json").read_text())
         data["provenance"].pop("created_utc")
         data["provenance"].pop("command")
         return data
 
-    assert bits(5, "a") == bits(5, "b")
-    assert bits(6, "c")["projection"] != bits(5, "d")["projection"]
+    assert run(*SHORT, "--seed", "5").exit_code == 0
+    first = bits(tmp_path / "out")
+    assert first == bits(elsewhere[1])
+    assert run(*SHORT, "--seed", "6").exit_code == 0
+    assert bits(tmp_path / "out")["projection"] != first["projection"]
 
 
 def test_reference_on_the_emulated_rig(run):

@@ -1,17 +1,21 @@
 """replay, info, export, analyse: what they show, and what they refuse."""
 
 import json
+import random
 import shutil
 
+import msgspec
 import pytest
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.samples import ForceSample
+from microdrivers.recording.errors import RecordingError
 from microdrivers.recording.header import RecordingHeader
 from microdrivers.recording.playback import RecordingPlayback
+from microdrivers.recording.reader import Recording
 from microdrivers.recording.recorder import Recorder
-from microdrivers.routines.analysis import batch
+from microdrivers.routines.analysis import batch, read_table
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +97,95 @@ def test_info_tells_gaps_and_times_that_run_backwards(run, tmp_path):
     assert run("export", "a.mcap", "--to", "csv").exit_code == 0
     assert "no frames to show" in run("info", "a.mcap", "--contact-sheet", "sheet.png").stderr
     assert "no frames to export" in run("export", "a.mcap", "--to", "video").stderr
+
+
+def test_times_out_of_order_and_dropped_samples_are_told_to_who_uses_them(run, optics_recording, tmp_path):
+    bus, clock = Bus(), SimulatedClock()
+    with (
+        Recording(optics_recording) as whole,
+        Recorder(tmp_path / "a.mcap", bus=bus, clock=clock, header=RecordingHeader(source="recorded")) as recorder,
+    ):
+        for topic, sample in whole.samples():
+            later = 10**9 if (topic, sample.seq) == ("stage", 3) else 0
+            bus.topic(topic, type(sample)).publish(msgspec.structs.replace(sample, t_ns=sample.t_ns + later))
+        recorder._lost("zoom", 2, "the disk does not keep up")
+    for command in (
+        ("replay", "a.mcap"), ("export", "a.mcap", "--to", "csv"), ("calibrate", "optics", "--replay", "a.mcap"),
+        ("calibrate", "optics", "--replay", "a.mcap", "--json"), ("calibrate", "force", "--replay", "a.mcap"),
+    ):  # fmt: skip
+        told = run(*command).stderr
+        assert "out of order: 1 samples of 'stage'" in told
+        assert "not recorded: 2 samples of 'zoom'" in told
+    run("analyse", "a.mcap", "--out", "t.csv")
+    [row] = read_table(tmp_path / "t.csv")
+    assert (row["losses"], row["dropped"], row["unsorted"]) == ("0", "2", "1")
+
+
+def copy_without(source, file, topic):
+    bus = Bus()
+    with (
+        Recording(source) as whole,
+        Recorder(file, bus=bus, clock=SimulatedClock(), header=RecordingHeader(source="recorded")),
+    ):
+        for name, sample in whole.samples(leave_out=(topic,)):
+            bus.topic(name, type(sample)).publish(sample)
+
+
+def test_topics_that_an_estimator_lacks_are_named(run, optics_recording, force_recording, tmp_path):
+    for kind, source, topic, told in (
+        ("optics", optics_recording, "stage", "no samples of 'stage'"),
+        ("optics", optics_recording, "zoom", "no samples of 'zoom'"),
+        ("optics", optics_recording, "camera", "lacks the frame"),
+        ("force", force_recording, "force", "no samples of 'force'"),
+        ("force", force_recording, "deformation", "no samples of 'deformation'"),
+        ("force", force_recording, "routine", "holds no force characterisation"),
+    ):
+        copy_without(source, tmp_path / f"no-{topic}.mcap", topic)
+        result = run("calibrate", kind, "--replay", f"no-{topic}.mcap")
+        assert (result.exit_code, told in result.stderr) == (1, True), result.stderr
+
+
+def test_two_recordings_in_one_file_and_two_writers_to_one(run, run_file, force_recording, tmp_path):
+    one, other = run_file.read_bytes(), force_recording.read_bytes()
+    (tmp_path / "joined.mcap").write_bytes(one + other)
+    blocks = [data[at : at + 4096] for at in range(0, len(one), 4096) for data in (one, other)]
+    (tmp_path / "mixed.mcap").write_bytes(b"".join(blocks))
+    for name in ("joined", "mixed"):
+        result = run("replay", f"{name}.mcap")
+        assert result.exit_code == 0
+        assert "or something follows it" in result.stderr
+    assert "91 of 91 samples" in run("replay", "joined.mcap").stdout
+
+
+def content(file):
+    try:
+        with Recording(file) as recording:
+            return recording.header, [(topic, sample.order) for topic, sample in recording.samples()]
+    except RecordingError:
+        return None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_damage_is_silent_or_a_traceback(run, force_recording, tmp_path, seed):
+    whole, chance = force_recording.read_bytes(), random.Random(seed)
+    for _ in range(12):
+        data = bytearray(whole)
+        if chance.random() < 0.3:
+            del data[chance.randrange(len(data)) :]
+        else:
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        file = tmp_path / "damaged.mcap"
+        file.write_bytes(data)
+        unharmed = content(file) == content(force_recording)  # a bit of an index, which nobody needs
+        for command in (("info",), ("replay",), ("export", "--to", "csv"), ("recording", "repair")):
+            (tmp_path / "damaged.repaired.mcap").unlink(missing_ok=True)
+            shutil.rmtree(tmp_path / "damaged-export", ignore_errors=True)
+            result = run(*command[:2], file) if command[0] == "recording" else run(command[0], file, *command[1:])
+            told = result.output + result.stderr
+            assert result.exit_code in (0, 1)
+            assert unharmed or any(word in told for word in ("not readable", "  lost  ", "\nlost ", "error: "))
+            assert unharmed or "lost       nothing" not in told
+            assert unharmed or "nothing was lost" not in told
 
 
 def test_replay(run, run_file, monkeypatch):

@@ -92,3 +92,24 @@ def test_a_machine_without_a_resolvable_name_gives_an_address(tmp_path, monkeypa
         host = ServeRequest(transport="tcp", bind=bind, folder=tmp_path).host
         assert host not in ("", "0.0.0.0", "::")
     assert ServeRequest(transport="tcp", bind="127.0.0.1", folder=tmp_path).host == "127.0.0.1"
+
+
+@pytest.mark.xdist_group("real_time")
+def test_what_is_served_has_patience_with_a_busy_computer_and_says_so(tmp_path):
+    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8"))
+    data["devices"]["gripper_stage"] |= {"heartbeat_ms": 2000}
+    data["devices"]["gripper_stage"]["connection"] |= {"timeout_s": 3.0}
+    lab, file = tmp_path / "lab.yaml", tmp_path / "served.yaml"
+    lab.write_text(yaml.safe_dump(data), encoding="utf-8")
+    before = load_rig_file(lab).rig
+    with ServedRig(load_rig_file(lab)) as serving:
+        serving.write(file)
+    served = load_rig_file(file)
+    assert [guard.stale_after_ms for guard in before.safety.force_guards] == [50.0]  # hardware keeps its own
+    assert [guard.stale_after_ms for guard in served.rig.safety.force_guards] == [500.0]
+    probe, gripper, force = [served.devices[name].settings for name in ("probe_stage", "gripper_stage", "probe_force")]
+    assert (probe.heartbeat_ms, probe.connection.timeout_s) == (500, 1.0)
+    assert (gripper.heartbeat_ms, gripper.connection.timeout_s) == (2000, 3.0)  # nobody is made less patient
+    assert force.connection.timeout_s == 1.0
+    comment = [line for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    assert "heartbeat_ms, timeout_s and stale_after_ms allow for a computer" in comment[1]

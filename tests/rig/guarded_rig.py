@@ -10,11 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.contact_samples import Intervention
+from microdrivers.core.errors import MoveCancelled
 from microdrivers.core.samples import DeviceEvent, ForceSample
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import ForceSensor
@@ -26,6 +28,8 @@ STIFFNESS_UN_PER_UM = 20.0
 SURFACE_UM = -50.0
 """Of the probe stage's x axis."""
 
+AT_LIMIT_UM = SURFACE_UM - LIMIT_UN / STIFFNESS_UN_PER_UM
+RETRACT_UM = 400.0
 PERIOD_NS = 5_000_000
 STALE_NS = 50_000_000
 _STAND_STILL = 37
@@ -140,3 +144,11 @@ def guarded_rig(folder: Path, *, clock: Clock | None = None, referenced: bool = 
             yield guarded
         finally:
             guarded.wake()
+
+
+def press_too_hard(guarded, *, speed_um_s=50.0):
+    """Move into the specimen until the guard acts; returns the error of the move."""
+    guarded.stage.move_to(x_um=AT_LIMIT_UM + 10.0)
+    with pytest.raises(MoveCancelled) as caught:
+        guarded.stage.move_to(x_um=AT_LIMIT_UM - 100.0, speed_um_s=speed_um_s)
+    return caught.value

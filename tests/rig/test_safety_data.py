@@ -157,3 +157,15 @@ def test_in_real_time_the_guard_stops_in_the_receiving_thread_and_retracts_in_an
         guarded.rig.safety.finish()
         assert guarded.rules() == ["force limit", "retraction"]
         assert guarded.stage.read().x_um > 300.0
+
+
+def test_a_computer_that_looks_too_late_says_that_it_is_too_busy(guarded):
+    flow = guarded.rig.safety.guards["probe_force"]._flow
+    guarded.stage.start_move_to(x_um=-300.0, speed_um_s=50.0)
+    guarded.clock.sleep(0.3)
+    guarded.silence()
+    assert "busy" not in flow.complaint
+    flow._looked_ns -= 200 * NS_PER_MS  # as if the computer had done something else since
+    guarded.clock.sleep(0.1)
+    assert "this computer is too busy: it looked 2" in flow.complaint
+    assert "this computer is too busy" in guarded.stops()[0].reason

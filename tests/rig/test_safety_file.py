@@ -106,7 +106,7 @@ MISTAKES = {
         "'probe_force' stands here twice", "keep one",
     ),
     "a zero beyond the limit": (GUARD, "zero_within_uN: 1600", "hide the whole limit", "less than"),
-    "an empty list": (f"  keep_out:\n{BOX}", f"  keep_out: []\n#{BOX}", "a list is needed here", "correct the value"),
+    "an empty list": (f"  keep_out:\n{BOX}", f"  keep_out: []\n#{BOX}", "a list is needed here", "write none"),
     "half a section": ("  keep_out:", "  keep_uot:", "unknown key", "did you mean 'keep_out'"),
     "a box inside out": ("max_um: [15000, 15000, -500]", "max_um: [15000, 15000, -5500]", "along z a box", "correct"),
     "a flat point": ("min_um: [0, 0, -5000]", "min_um: [0, 0]", "a point is needed here: [x, y, z]", "correct"),

@@ -9,18 +9,18 @@ from microdrivers.core.errors import ErrorTree, LinkLost, MicrodriversError, Mov
 from microdrivers.core.samples import ForceSample
 from microdrivers.devices.force_sensor import SATURATED, UNTARED, Tare
 from tests.rig.guarded_rig import (
+    AT_LIMIT_UM,
     LIMIT_UN,
     OTHER,
     PERIOD_NS,
+    RETRACT_UM,
     SENSOR,
     STAGE,
     STIFFNESS_UN_PER_UM,
-    SURFACE_UM,
     guarded_rig,
+    press_too_hard,
 )
 
-AT_LIMIT_UM = SURFACE_UM - LIMIT_UN / STIFFNESS_UN_PER_UM
-RETRACT_UM = 400.0
 QUICK_STOP = 2
 TO_THE_SWITCH = 17
 
@@ -29,14 +29,6 @@ TO_THE_SWITCH = 17
 def guarded(tmp_path):
     with guarded_rig(tmp_path) as rig:
         yield rig
-
-
-def press_too_hard(guarded, *, speed_um_s=50.0):
-    """Move into the specimen until the guard acts; returns the error of the move."""
-    guarded.stage.move_to(x_um=AT_LIMIT_UM + 10.0)
-    with pytest.raises(MoveCancelled) as caught:
-        guarded.stage.move_to(x_um=AT_LIMIT_UM - 100.0, speed_um_s=speed_um_s)
-    return caught.value
 
 
 # ---------------------------------------------------------------------- too much force

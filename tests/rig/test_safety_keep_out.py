@@ -250,6 +250,7 @@ def test_the_tip_is_where_holder_and_axes_say(tmp_path):
     stage = {
         "origin_um": [1000.0, 2000.0, 3000.0],
         "axes_in_rig": {"x": [cos, 0.0, -sin], "y": [0, 1, 0], "z": [sin, 0, cos]},
+        "retract_um": [0, 0, 200],
     }  # fmt: skip
     box = {"name": "floor", "min_um": [0, 0, 0], "max_um": [5000, 5000, 2900]}
     with guarded_rig(tmp_path, stage=stage, safety={"force_guards": "none", "keep_out": [box]}) as kept:

@@ -1,0 +1,88 @@
+"""`calibrate force`: what cannot be analysed is refused, and what was measured is kept however it ends."""
+
+import csv
+import pathlib
+
+import pytest
+
+from microdrivers.cli.calibrate_force import _run
+from microdrivers.cli.progress import TerminalProgress
+from microdrivers.core.errors import MoveCancelled
+from microdrivers.results.force import read_force_result
+from tests.routines.indentation_source import K1, MadeUpSource
+
+REAL = pathlib.Path(__file__).parents[1] / "data" / "force" / "chiaro_aebp1_30hz.csv"
+KNOWN = {"source": "made up", "clock": "simulated", "settings": {}}
+
+
+def measured(folder):
+    with (folder / "record.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_nothing_is_opened_if_the_operator_says_no(run, tmp_path):
+    result = run("calibrate", "force", "--rig", tmp_path / "no.yaml", "--out", tmp_path / "out", stdin="n\n")
+    assert result.exit_code == 1
+    assert "Is the specimen held" in result.stderr
+    assert "Aborted" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path, capsys):
+    source = MadeUpSource(broken_off_at=600, error=MoveCancelled("the force guard has stopped it"))
+    with pytest.raises(MoveCancelled):
+        _run(source, KNOWN, True, tmp_path, False, TerminalProgress(quiet=True))
+    result = read_force_result(tmp_path / "result.json")
+    assert not result.complete
+    assert result.notes[-1] == (
+        "The run ended early: the force guard has stopped it. The result holds what had been measured until then."
+    )
+    assert result.protocols["single"].k1_uN_per_um == pytest.approx(K1, rel=0.05)
+    assert len(measured(tmp_path)) == 600
+    assert "ended early" in (tmp_path / "report.html").read_text()
+    assert f"what was measured is in {tmp_path / 'record.csv'}" in capsys.readouterr().err
+
+
+def test_an_interruption_before_the_contact_keeps_the_record(tmp_path):
+    source = MadeUpSource(broken_off_at=60, error=KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        _run(source, KNOWN, True, tmp_path, False, TerminalProgress(quiet=True))
+    assert source.finished == 1
+    assert len(measured(tmp_path)) == 60
+    assert not (tmp_path / "result.json").exists()
+
+
+def _in_mN(rows):
+    return [[row[0], row[1], str(float(row[2]) / 1000.0)] for row in rows]
+
+
+def _in_ms(rows):
+    return [[str(float(row[0]) * 1e6), *row[1:]] for row in rows]
+
+
+def _constant(rows):
+    return [[*row[:2], "0.01"] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_in_mN, "implausible units"),
+        (_in_ms, "implausible units: samples come every 3.333e+04 s"),
+        (_constant, "the force is constant, 0.01 µN"),
+        (lambda rows: rows[:20] + rows[40:], "gap of 0.700 s"),
+        (lambda rows: [*rows[:30], rows[29], *rows[30:]], "time does not increase"),
+        (lambda rows: [[row[0], "nan", row[2]] if n % 3 else row for n, row in enumerate(rows)], "was lost in"),
+        (lambda rows: rows[:15], "at least 20 are needed"),
+    ],
+)
+def test_a_recording_that_cannot_be_analysed_is_refused(run, tmp_path, change, message):
+    lines = [line for line in REAL.read_text().splitlines() if not line.startswith("#")]
+    rows = change([line.split(",")[:3] for line in lines[1:]])
+    file = tmp_path / "indentation.csv"
+    file.write_text("\n".join(["time_s,indentation_um,force_uN", *(",".join(row) for row in rows)]))
+    result = run("calibrate", "force", "--csv", file, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert "to do:" in result.stderr
+    assert not (tmp_path / "out").exists()

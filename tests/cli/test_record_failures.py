@@ -1,0 +1,91 @@
+"""A disk that is full, a folder that takes no file: what was configured happens, and what is lost is told."""
+
+import contextlib
+import json
+import resource
+
+import pytest
+
+from microdrivers.configs import shipped_rig
+from microdrivers.recording.reader import Recording
+
+
+@contextlib.contextmanager
+def disk_with(size):
+    """No file of this process may grow larger: the kernel refuses the write, as it does on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("on_failure", ["stop", "go-on"])
+def test_record_on_a_full_disk(run, tmp_path, on_failure):
+    with disk_with(1_500_000):
+        result = run(
+            "record", shipped_rig("microscope"), "--fake", "--for", 0.4, "--out", "a.mcap", "--on-failure", on_failure
+        )
+    assert result.exit_code == 1
+    recording = Recording(tmp_path / "a.mcap")
+    cameras = recording.topics["camera_fine"]
+    assert recording.losses == []
+    assert recording.complete
+    assert 0 < cameras.count < 6
+    if on_failure == "stop":
+        assert "could not be written: File too large" in result.stderr
+        assert "--on-failure go-on" in result.stderr
+        assert cameras.last_t_ns < recording.topics["sample_stage"].last_t_ns < 0.35e9
+    else:
+        assert f"camera_fine         {cameras.count} samples, {cameras.dropped} dropped" in result.stdout
+        assert "could not be written all the time: File too large" in result.stdout
+        assert cameras.count + cameras.dropped == recording.topics["truth/optics"].count > 10
+        assert recording.topics["sample_stage"].last_t_ns > 0.35e9
+    assert f"not recorded: {cameras.dropped} samples of 'camera_fine'" in run("replay", "a.mcap").stderr
+
+
+def test_a_calibration_goes_on_without_its_disk_and_says_what_its_recording_lacks(run, tmp_path):
+    with disk_with(1_500_000):
+        result = run("calibrate", "optics", "--frames", 20, "--zoom-to", 0.9, "--out", "run")
+    assert result.exit_code == 0, result.stderr
+    dropped = Recording(tmp_path / "run" / "run.mcap").topics["camera_fine"].dropped
+    assert dropped > 20
+    assert f"MB; it lacks {dropped} samples that could not be written)" in result.stdout
+    result = run("calibrate", "optics", "--replay", "run/run.mcap")
+    assert (result.exit_code, f"not recorded: {dropped} samples" in result.stderr) == (1, True)
+
+
+def test_a_disk_without_any_space_is_told_before_anything_moves(run, tmp_path):
+    for command in (
+        ("record", shipped_rig("microscope"), "--fake", "--for", 1, "--out", "run.mcap"),
+        ("calibrate", "optics", "--out", "."),
+    ):
+        with disk_with(100):
+            result = run(*command)
+        assert result.exit_code == 1
+        assert "the recording cannot be written there: File too large" in result.stderr
+        assert "referencing" not in result.stderr
+        assert not (tmp_path / "run.mcap").exists()
+
+
+def test_folders_that_take_no_recording(run, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for folder, why in (("file", "Not a directory"), ("none", "No such file"), ("/proc", "No such file")):
+        result = run("record", shipped_rig("microscope"), "--fake", "--for", 1, "--out", f"{folder}/a.mcap")
+        assert (result.exit_code, why in result.stderr) == (1, True), result.stderr
+    for kind in ("optics", "force"):
+        result = run("calibrate", kind, "--out", "file/run")
+        assert (result.exit_code, "nothing can be written there" in result.stderr) == (1, True), result.stderr
+
+
+def test_images_may_be_compressed(run, tmp_path):
+    result = run("calibrate", "optics", "--frames", 20, "--zoom-to", 0.9, "--out", "run", "--compress-images")
+    assert result.exit_code == 0, result.stderr
+    file = tmp_path / "run" / "run.mcap"
+    size = file.stat().st_size
+    assert f"run.mcap ({size / 1e6:.1f} MB)" in result.stdout
+    assert size < 0.75 * 640 * 480 * Recording(file).topics["camera_fine"].count
+    assert run("calibrate", "optics", "--replay", file, "--out", "again").exit_code == 0
+    one, other = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("run", "again"))
+    assert (one["projection"], one["covariance"]) == (other["projection"], other["covariance"])
