@@ -12,8 +12,8 @@ from enum import IntEnum
 
 from microdrivers.backends.lines.can_line import CanLine, Listening, Received
 from microdrivers.core.clock import Timer
-from microdrivers.core.errors import LinkError
-from microdrivers.core.units import NS_PER_S, seconds_to_ns
+from microdrivers.core.errors import BusyError, LinkError
+from microdrivers.core.units import NS_PER_MS, NS_PER_S, seconds_to_ns
 
 HOST_NODE_ID = 127
 """Our own node id, under which our heartbeat goes out; no device may have it."""
@@ -21,6 +21,10 @@ HOST_NODE_ID = 127
 NMT_ID, HEARTBEAT_ID = 0x000, 0x700
 
 _NEVER_NS = 1 << 63
+_LATE_NS = 40 * NS_PER_MS
+"""A heartbeat that is later is worth being told of."""
+
+_OTHER_HOST_NS = 2 * NS_PER_S
 
 
 class NmtCommand(IntEnum):
@@ -100,10 +104,34 @@ class Heartbeats:
         self._timer: Timer | None = None
         self._upkeep: Listening | None = None
         self._last_ns = -_NEVER_NS
+        self._since_ns = self._other_host_ns = -_NEVER_NS
+        self._listening = line.listen(HEARTBEAT_ID + HOST_NODE_ID, self._hear_other_host)
+
+    def refuse_other_host(self, interval_s: float) -> None:
+        """Let pass only if no other program says that it drives this bus. Only what came since it was opened counts.
+
+        In real time it is awaited for a little more than that interval, which is ours, and so that of a program of the
+        same rig file.
+
+        Raises:
+            BusyError: one does; nothing was changed in any node.
+        """
+        line, clock = self._line, self._line.clock
+        wait_ns = self._since_ns + seconds_to_ns(1.2 * interval_s) - clock.now_ns()
+        if wait_ns > 0 and not clock.simulated:
+            line.wait(clock.event(), wait_ns / NS_PER_S)
+        if clock.now_ns() - self._other_host_ns < _OTHER_HOST_NS:
+            raise BusyError(
+                f"another program drives CAN bus {line.connection.channel}: it sends a host's heartbeat",
+                moved="no",
+                remedy="end it first: two programs would take each other's drives and sensors away",
+            )
 
     def produce(self, interval_s: float) -> Listening:
         """Send our heartbeat at least so often, until cancelled; watches are looked at in the same beat."""
         interval_ns = seconds_to_ns(interval_s)
+        if not self._intervals_ns:
+            self._since_ns = self._line.clock.now_ns()
         self._intervals_ns.append(interval_ns)
         self._restart()
 
@@ -125,6 +153,9 @@ class Heartbeats:
         """End a watch."""
         watch.end()
         self._watches = tuple(each for each in self._watches if each is not watch)
+
+    def _hear_other_host(self, _received: Received) -> None:
+        self._other_host_ns = self._line.clock.now_ns()
 
     def _restart(self) -> None:
         timer, self._timer = self._timer, None
@@ -152,4 +183,6 @@ class Heartbeats:
         if since_ns < interval_ns * 3 // 2:
             for watch in self._watches:
                 watch.check(now_ns)
+        elif _LATE_NS < since_ns - interval_ns < _NEVER_NS // 2:
+            self._line.lateness.note(now_ns, since_ns - interval_ns)
         return now_ns + interval_ns

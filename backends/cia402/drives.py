@@ -37,6 +37,7 @@ class Drives:
     Attributes:
         all: the drives, in the order of the axes.
         stops: changes before and after every stop that is sent.
+        line: the bus.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Drives:
         self.stops = 0
         self.pdos = SyncedPdos(line, [drive.status_id for drive in drives], on_set=on_set, on_lost=on_lost)
         self.clock: Clock = line.clock
+        self.line = line
         self._timeout_s = timeout_s
         self._check = check
 

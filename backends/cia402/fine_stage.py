@@ -20,7 +20,7 @@ from microdrivers.backends.cia402.homing import ReferenceSearch, refuse_other_or
 from microdrivers.backends.cia402.path import write_path
 from microdrivers.backends.cia402.pose import pose_sample
 from microdrivers.backends.cia402.power import reset_faults, rest, switch_off
-from microdrivers.backends.cia402.set_up import describe, identify_all, set_up
+from microdrivers.backends.cia402.set_up import HEARTBEATS_A_TIMEOUT, describe, identify_all, set_up
 from microdrivers.backends.cia402.settings import FineStageSettings
 from microdrivers.backends.cia402.states import Control
 from microdrivers.backends.lines.can_line import Listening, shared_can_line
@@ -138,9 +138,11 @@ class Cia402FineStage(FineStage):
         self._guard.cleared()
         self.fault = None
         heartbeats = self._line.service(Heartbeats)
-        self._listening.append(heartbeats.produce(self._settings.heartbeat_ms / 2000))
+        interval_s = self._settings.heartbeat_ms / 1000 / HEARTBEATS_A_TIMEOUT
+        self._listening.append(heartbeats.produce(interval_s))
         try:
             found = identify_all(self._drives.all, device=self.name)
+            heartbeats.refuse_other_host(interval_s)
             self._be_ready()
             self._drives.pdos.begin_listening()
             self._drives.look()

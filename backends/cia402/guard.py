@@ -15,6 +15,7 @@ from microdrivers.core.samples import EventKind
 
 _FAULT_REMEDY = "find the cause, make sure that the way is free, then clear_fault()"
 
+_HEARTBEAT_LOST = 0x8130
 _MERE_WARNINGS = (0x8110, 0x8120, 0x8140, 0x8210, 0x8220)
 """Trouble on the bus that a drive reports and does not stop for."""
 
@@ -57,7 +58,8 @@ class Guard:
         if emergency.code in _MERE_WARNINGS:
             _log.warning("%s: %s", drive.name, emergency)
             return
-        self._note(drive, f"{drive.name}: {emergency}", emergency.code)
+        busy = self._busy if emergency.code == _HEARTBEAT_LOST else ""
+        self._note(drive, f"{drive.name}: {emergency}{busy}", emergency.code, busy=bool(busy))
 
     def heartbeat(self, drive: Drive, state: int) -> None:
         """A drive has sent its heartbeat, or has started."""
@@ -72,8 +74,8 @@ class Guard:
     def silence(self, drive: Drive) -> None:
         """A drive's heartbeat has stopped."""
         if self.on_duty:
-            self._lose(drive, f"{drive.name} is silent: its heartbeat has stopped")
-            self._tell("link_lost", f"no heartbeat from {drive.name}")
+            self._lose(drive, f"{drive.name} is silent: its heartbeat has stopped{self.drives.line.doubts}")
+            self._tell("link_lost", f"no heartbeat from {drive.name}{self.drives.line.doubts}")
 
     def lost(self, error: LinkLost) -> None:
         """The adapter is gone: nobody can be stopped, but drives miss our heartbeat. The stage has to be reopened."""
@@ -137,9 +139,8 @@ class Guard:
         self.require_alive()
         for drive in self.drives.all:
             if not drive.ready:
-                raise LinkLost(
-                    f"{drive.name} has restarted", remedy="make sure that the way is free, then reference it"
-                )
+                remedy = f"make sure that the way is free, then reference([{drive.axis!r}])"
+                raise LinkLost(f"{drive.name} has restarted", remedy=remedy)
 
     def require_alive(self) -> None:
         """Let pass only if no drive is known to be silent.
@@ -149,9 +150,10 @@ class Guard:
         """
         for drive in self.drives.all:
             if not drive.node.alive:
+                remedy = self.drives.line.lateness.REMEDY if self._busy else "check the drive's power and cable"
                 raise LinkLost(
-                    f"{drive.name} is silent: its heartbeat has stopped",
-                    remedy="check the drive's power and cable; it is set up again when it is back",
+                    f"{drive.name} is silent: its heartbeat has stopped{self.drives.line.doubts}",
+                    remedy=f"{remedy}; it is set up again when it is back",
                 )
 
     def told(self) -> None:
@@ -165,15 +167,21 @@ class Guard:
 
     # ------------------------------------------------------------------ inside
 
-    def _note(self, drive: Drive, what: str, code: int) -> None:
+    @property
+    def _busy(self) -> str:
+        """What a message adds if this computer may be to blame."""
+        return self.drives.line.lateness.hint(self.drives.clock.now_ns())
+
+    def _note(self, drive: Drive, what: str, code: int, *, busy: bool = False) -> None:
         known = self._faults.get(drive.axis)
         if known is not None:
             if code and not known.code:
                 _explain(known, what, code)
             return
         fault = self._faults[drive.axis] = DeviceFault(
-            what, code=code, text=error_meaning(code) if code else "", remedy=_FAULT_REMEDY
-        )
+            what, code=code, text=error_meaning(code) if code else "",
+            remedy=f"{self.drives.line.lateness.REMEDY}; then clear_fault()" if busy else _FAULT_REMEDY,
+        )  # fmt: skip
         self._to_raise = fault
         self._stop_others(drive, what)
         drive.watch.forget_target()

@@ -129,11 +129,11 @@ class ReferenceSearch:
         method = self._drive.settings.homing_method
         return DeviceFault(
             f"{self._drive.name} has not found its reference (homing method {method}): {why}", moved="yes",
-            remedy="check the switches, the way, and homing_method of the axis in the rig file; then clear the fault",
+            remedy="check the switches, the way, and homing_method of the axis in the rig file; then clear_fault()",
         )  # fmt: skip
 
     def _cancelled(self) -> MoveCancelled:
         return MoveCancelled(
             f"the reference search of {self._drive.name} was stopped",
-            remedy="check why the stop was requested, then reference the axis again",
+            remedy=f"check why the stop was requested, then reference([{self._drive.axis!r}])",
         )

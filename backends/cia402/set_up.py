@@ -26,7 +26,10 @@ HOLD_POSITION_AFTER_QUICK_STOP = 6
 """Option code: brake with the quick stop ramp, then stay in quick stop active."""
 
 MISSED_HEARTBEATS = 1.5
-"""After so many intervals without one a heartbeat is missed; looked at twice an interval, within 2 in all."""
+"""After so many intervals without one a heartbeat is missed; looked at four times an interval, within 2 in all."""
+
+HEARTBEATS_A_TIMEOUT = 4
+"""So many of ours come in the time that drives allow for one: a busy computer may be three quarters of it late."""
 
 _POLL_S = 0.01
 _STATE_S = 1.0

@@ -215,7 +215,7 @@ class CanAdapter:
                 lock.close()
                 raise
             self._port_lock = lock
-            return bus
+            return self._read_in_bulk(bus)
         except NotImplementedError as error:
             raise ConfigError(
                 f"python-can cannot use the interface {wanted.interface!r}: {error}", key="connection.interface",
@@ -229,6 +229,13 @@ class CanAdapter:
                 f"python-can refuses these settings of {_name(wanted)}: {error}", key="connection",
                 remedy="correct channel, bitrate and options",
             ) from error  # fmt: skip
+
+    def _read_in_bulk(self, bus: can.BusABC) -> can.BusABC:
+        if self._connection.interface != "slcan":
+            return bus
+        from microdrivers.backends.lines.slcan_in_bulk import in_bulk  # which imports python-can
+
+        return in_bulk(bus, self._counters)
 
     def _remedy(self, number: int | None, otherwise: str) -> str:
         channel, bitrate = self._connection.channel, self._connection.bitrate

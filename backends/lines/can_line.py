@@ -19,6 +19,7 @@ from microdrivers.backends.lines.can_listeners import (
     SILENCE_REMEDY,
     Awaited,
     CanCounters,
+    Lateness,
     Listener,
     Listeners,
     Listening,
@@ -55,12 +56,14 @@ class CanLine:
         newest_ns: stamp of the newest frame received, ns.
         shortest_ns: by number of bytes, the shortest time that a data frame can take on the bus.
         tap: is told every frame that passes, if somebody listens there.
+        lateness: of this computer, as far as somebody has noted it.
     """
 
     def __init__(self, connection: CanConnection, *, clock: Clock) -> None:
         self.connection = connection
         self.clock = clock
         self.counters = CanCounters()
+        self.lateness = Lateness()
         self.newest_ns = -1
         self.tap: CanTap | None = None
         self._load = LoadMeter(connection.bitrate)
@@ -173,9 +176,15 @@ class CanLine:
         return found
 
     def silence(self, what: str, timeout_s: float) -> LinkTimeout:
-        """The error for something that has not come; it says so if the bit rate is to be suspected."""
+        """The error for something that has not come; it says so if bit rate or this computer are to be suspected."""
         where = f"within {1000 * timeout_s:.0f} ms on CAN bus {self.connection.channel}"
-        return LinkTimeout(f"{what} {where}{self.counters.hint()}", remedy=SILENCE_REMEDY)
+        remedy = self.lateness.REMEDY if self.lateness.hint(self.clock.now_ns()) else SILENCE_REMEDY
+        return LinkTimeout(f"{what} {where}{self.doubts}", remedy=remedy)
+
+    @property
+    def doubts(self) -> str:
+        """What else may be to blame if somebody is silent: the adapter, the bit rate, this computer."""
+        return f"{self.counters.hint()}{self.lateness.hint(self.clock.now_ns())}"
 
     def on_loss(self, call: LossListener) -> Listening:
         """Call when the adapter is gone or off the bus, in whichever thread notices; not when the line is closed."""

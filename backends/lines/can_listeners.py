@@ -10,12 +10,14 @@ import msgspec
 
 from microdrivers.core.clock import Clock, ClockEvent
 from microdrivers.core.errors import LinkLost
+from microdrivers.core.units import NS_PER_MS, NS_PER_S
 
 SILENCE_REMEDY = (
     "check power, the node id switches, the bit rate, the cable and its termination (60 Ω between CAN_H and CAN_L)"
 )
 
 _NEVER_NS = 1 << 63
+_REMEMBERED_NS = 2 * NS_PER_S
 
 
 class Received(msgspec.Struct, frozen=True, gc=False):
@@ -67,12 +69,38 @@ class CanCounters:
         self.timeouts = 0
         self.error_frames = 0
         self.garbled = 0
+        self.refused = 0
 
     def hint(self) -> str:
-        """What a message of something that failed may add: whether the bit rate is to be suspected."""
+        """What a message of something that failed may add: whether bit rate or adapter are to be suspected."""
+        if self.refused:
+            return f" (the adapter has refused {self.refused} frames: it is off the bus, or nobody acknowledges them)"
         if self.error_frames and not self.received:
             return f" ({self.error_frames} error frames and no sound one: is the bit rate right?)"
         return f" ({self.error_frames} error frames)" if self.error_frames else ""
+
+
+class Lateness:
+    """Whether this computer has been too busy of late: it then blames nobody else first."""
+
+    REMEDY = (
+        "have this computer do less at once: end other programs, stream at lower rates; if that cannot be, allow more "
+        "time in the rig file (heartbeat_ms, timeout_s)"
+    )
+
+    def __init__(self) -> None:
+        self._until_ns = self._late_ns = 0
+
+    def note(self, now_ns: int, late_ns: int) -> None:
+        """Something that was due is done only now."""
+        self._late_ns = max(late_ns, self._late_ns if now_ns < self._until_ns else 0)
+        self._until_ns = now_ns + _REMEMBERED_NS
+
+    def hint(self, now_ns: int) -> str:
+        """What a message of something that failed may add; empty if the computer was in time."""
+        if now_ns >= self._until_ns:
+            return ""
+        return f" (this computer is too busy: our heartbeat was {self._late_ns / NS_PER_MS:.0f} ms late)"
 
 
 class Listeners:

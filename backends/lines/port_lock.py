@@ -31,6 +31,9 @@ class PortLock:
             return
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(descriptor)
+            raise BlockingIOError(error.errno, "it is in use") from error
         except OSError:
             os.close(descriptor)
             raise

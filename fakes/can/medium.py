@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.errors import OutOfRange
-from microdrivers.core.units import seconds_to_ns
+from microdrivers.core.units import NS_PER_MS, seconds_to_ns
 from microdrivers.fakes.can.arrival import PROTOCOL_ERROR
 from microdrivers.fakes.can.frame import Frame
 from microdrivers.fakes.can.pacing import Pacer, RealTimePacer, SimulatedPacer
@@ -24,6 +24,12 @@ LOG_LENGTH = 20_000
 BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 """Bit rates of CiA 301, and 100 kbit/s."""
 
+
+_LATE_NS = 5 * NS_PER_MS
+"""In real time: when something happens so much too late, the computer had other things to do."""
+
+_CATCHING_UP_NS = 20 * NS_PER_MS
+"""After that, others have their turn as well."""
 
 _Passed = tuple[int, Literal["host", "node", "error"], Frame]
 
@@ -72,6 +78,7 @@ class Medium:
         self.plugged = True
         self._timeline = BusTimeline(bitrate=bitrate, on_passed=self._deliver)
         self._ports: list[Port] = []
+        self._excused_ns = 0
         self._draw = random.Random(seed).random
         self._max_delay_ns = seconds_to_ns((temper or Temper()).max_delay_s) if clock.simulated else 0
         self._pacer: Pacer
@@ -151,11 +158,25 @@ class Medium:
     # ------------------------------------------------------------------ time
 
     def turn(self, t_ns: int | None = None) -> int:
-        """Let happen what is due by `t_ns`, or by now; returns when something happens next, `NEVER_NS` if nothing."""
+        """Let happen what is due by `t_ns`, or by now; returns when something happens next, `NEVER_NS` if nothing.
+
+        In real time nodes do not blame hosts for as long as the computer did not let the bus go on.
+        """
         with self.lock:
-            due_ns = self._timeline.play(self.clock.now_ns() if t_ns is None else t_ns)
+            now_ns = self.clock.now_ns()
+            if not self.clock.simulated:
+                self._excuse_hosts(now_ns)
+            due_ns = self._timeline.play(now_ns if t_ns is None else t_ns)
             self._pacer.plan(due_ns)
             return due_ns
+
+    def turned_by(self, tell: Callable[[], object] | None) -> None:
+        """In real time: somebody else calls `turn` from now on, and is told when it is to be earlier; None ends this.
+
+        It saves a thread that would have to be woken for each frame, and to wake another one.
+        """
+        if isinstance(self._pacer, RealTimePacer):
+            self._pacer.leave_to(tell)
 
     def next_event_ns(self) -> int:
         """When something happens next on the bus; `NEVER_NS` if all is quiet."""
@@ -194,6 +215,13 @@ class Medium:
             self._ports.remove(port)
         self._timeline.withdraw(port, self.clock.now_ns())
         self._plan()
+
+    def _excuse_hosts(self, now_ns: int) -> None:
+        """What hosts have sent may wait unread for as long as what was due here: nobody has let it happen."""
+        late_ns = now_ns - max(self._timeline.next_event_ns(), self._excused_ns)
+        if late_ns > _LATE_NS:
+            self._excused_ns = now_ns
+            self._timeline.excuse_hosts(late_ns, now_ns + _CATCHING_UP_NS)
 
     def _plan(self) -> None:
         self._pacer.plan(self._timeline.next_event_ns())

@@ -125,12 +125,21 @@ class RealTimePacer:
         self._lock = lock
         self._closed = False
         self._due_ns = NEVER_NS
+        self._tell: Callable[[], object] | None = None
         self._changed = clock.event()
         self._timer = clock.call_at(clock.now_ns(), self._run, name=f"CAN medium {name}")
 
     def plan(self, due_ns: int) -> None:
         """See `Pacer.plan`."""
-        if due_ns < self._due_ns:
+        if self._tell is not None:
+            self._tell()
+        elif due_ns < self._due_ns:
+            self._changed.set()
+
+    def leave_to(self, tell: Callable[[], object] | None) -> None:
+        """Somebody else turns the medium from now on, and is told when that changes; None ends this."""
+        with self._lock:
+            self._tell = tell
             self._changed.set()
 
     def call_at(self, t_ns: int, call: Call) -> None:
@@ -149,7 +158,7 @@ class RealTimePacer:
             with self._lock:
                 if self._closed:
                     return
-                self._due_ns = self._turn()
+                self._due_ns = self._turn() if self._tell is None else NEVER_NS
                 self._changed.clear()
             wait_s = (self._due_ns - self._clock.now_ns()) / NS_PER_S
             if wait_s > 0:

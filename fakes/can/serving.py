@@ -167,8 +167,11 @@ def _serve_adapter(link: str, medium: Medium, request: ServeRequest) -> Endpoint
     adapter.held_up = port.held_up
     bridge = Bridge(wire, medium.clock, port, name=link)
     adapter.wake = bridge.wake
+    adapter.turn_medium(True)
+    bridge.wake()
 
     def close() -> None:
+        adapter.turn_medium(False)
         with medium.lock:
             adapter.wake = None
         bridge.close()

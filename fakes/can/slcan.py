@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import re
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -55,6 +56,8 @@ class SlcanAdapter:
         self._medium = medium
         self._byte_ns = byte_ns
         self._woken = False
+        self._looker = 0
+        self._turns = False
         self._line = bytearray()
         self._bitrate: int | None = None
         self._port: Port | None = None
@@ -69,6 +72,11 @@ class SlcanAdapter:
         self._line.clear()
         self._bitrate, self._flags, self._line_free_ns = None, 0, 0
         self._leaving_ns.clear()
+
+    def turn_medium(self, turns: bool) -> None:
+        """Let the medium go on whenever the adapter is asked to, or no more: in real time, once `wake` is set."""
+        self._turns = turns
+        self._medium.turned_by(self._tell if turns else None)
 
     # ------------------------------------------------------------------ as a WireEmulator
 
@@ -89,7 +97,9 @@ class SlcanAdapter:
     def advance(self, t_ns: int) -> Sequence[Reply]:
         """Pass on what has arrived on the bus by `t_ns`."""
         replies: list[Reply] = []
-        port, self._woken = self._port, False
+        if self._turns:
+            self._medium.turn(t_ns)
+        port = self._port
         try:
             while port is not None and (arrival := port.poll(t_ns)) is not None:
                 replies += self._pass_on(arrival)
@@ -98,9 +108,14 @@ class SlcanAdapter:
         return replies
 
     def next_event_ns(self) -> int | None:
-        """When a frame can next have arrived."""
-        port = self._port
-        return None if port is None else port.next_arrival_ns()
+        """When a frame can next have arrived; from now on `wake` is called for others."""
+        self._looker = threading.get_ident()
+        self._woken, port = False, self._port  # before looking: what comes after this look wakes again
+        due_ns = None if port is None else port.next_arrival_ns()
+        if not self._turns:
+            return due_ns
+        event_ns = self._medium.next_event_ns()
+        return min(event_ns, event_ns if due_ns is None else due_ns)
 
     # ------------------------------------------------------------------ commands
 
@@ -175,7 +190,7 @@ class SlcanAdapter:
     # ------------------------------------------------------------------ to the host
 
     def _tell(self) -> None:
-        if self.wake is not None and not self._woken:
+        if self.wake is not None and not self._woken and threading.get_ident() != self._looker:
             self._woken = True
             self.wake()
 

@@ -18,6 +18,7 @@ class CanNode(Protocol):
 
     A node may have an attribute `listens_to`, a container that is replaced by another one, never altered: frames of
     identifiers that are not in it leave the node as it is, and need not be given to it. Without one, it is given all.
+    It may have a method `excuse_hosts`, see `BusTimeline`.
     """
 
     def receive(self, frame: Frame, t_ns: int) -> Sequence[Due]:
@@ -98,6 +99,14 @@ class BusTimeline:
         """Ask all nodes for their next events again."""
         for index in range(len(self._nodes)):
             self._look_at(index)
+
+    def excuse_hosts(self, late_ns: int, until_ns: int) -> None:
+        """Have nodes grant hosts `late_ns` more for what they have to send, and until `until_ns` at least."""
+        for index, node in enumerate(self._nodes):
+            excuse = getattr(node, "excuse_hosts", None)
+            if excuse is not None:
+                excuse(late_ns, until_ns)
+                self._look_at(index)
 
     # ------------------------------------------------------------------ frames
 

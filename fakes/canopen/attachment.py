@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import pydantic
@@ -14,6 +14,9 @@ from microdrivers.fakes.canopen.node import CanOpenNode
 
 SettingsT = TypeVar("SettingsT", bound=pydantic.BaseModel)
 
+SERVED_TIMEOUT_S = 1.0
+"""How long a host has to wait for a served emulator: it runs as a program among others, in Python."""
+
 
 class Connection(pydantic.BaseModel, extra="ignore", frozen=True):
     """The bus as the rig file names it."""
@@ -21,6 +24,7 @@ class Connection(pydantic.BaseModel, extra="ignore", frozen=True):
     interface: str
     channel: str | int
     bitrate: int = 500_000
+    timeout_s: float = 0.3
 
     @property
     def medium_name(self) -> str:
@@ -42,9 +46,14 @@ class NodeEmulation(Emulation):
 
 
 def attach_nodes(
-    request: EmulationRequest, connection: Connection, nodes: Sequence[CanOpenNode], devices: Mapping[str, Any]
+    request: EmulationRequest,
+    connection: Connection,
+    nodes: Sequence[CanOpenNode],
+    devices: Mapping[str, Any],
+    *,
+    served: Mapping[str, Any] | None = None,
 ) -> NodeEmulation:
-    """Switch the nodes on.
+    """Switch the nodes on; `served` are further settings that hold where they are served.
 
     Raises:
         ConfigError: the bus has another bit rate already. OutOfRange: there is no such bit rate.
@@ -66,7 +75,10 @@ def attach_nodes(
     def serve(where: ServeRequest) -> Endpoint:
         from microdrivers.fakes.can.serving import serve_medium
 
-        return serve_medium(request.name, medium, where)
+        endpoint = serve_medium(request.name, medium, where)
+        patient = {"timeout_s": max(connection.timeout_s, SERVED_TIMEOUT_S)}
+        connected = {"connection": {**endpoint.overrides["connection"], **patient}}
+        return replace(endpoint, overrides={**(served or {}), **connected})
 
     return NodeEmulation(
         overrides={"connection": {"interface": "microdrivers", "channel": name}},

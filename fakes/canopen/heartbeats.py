@@ -95,6 +95,12 @@ class HeartbeatConsumer:
         """When the next one is missed."""
         return min((watch.due_ns for watch in self._watches.values() if watch.due_ns is not None), default=None)
 
+    def postpone(self, by_ns: int, until_ns: int) -> None:
+        """Await those that are awaited so much longer, and until then at least."""
+        for watch in self._watches.values():
+            if watch.due_ns is not None:
+                watch.due_ns = max(watch.due_ns + by_ns, until_ns)
+
     def advance(self, t_ns: int) -> None:
         """Tell of those that have not come in time."""
         for watch in self._watches.values():

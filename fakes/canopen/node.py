@@ -142,6 +142,11 @@ class CanOpenNode:
                 self._next_ns = min(self._next_ns, t_ns)
         self._on_disturbed()
 
+    def excuse_hosts(self, late_ns: int, until_ns: int) -> None:
+        """Their heartbeats are due `late_ns` later, and not before `until_ns`: see `BusTimeline`."""
+        self._consumer.postpone(late_ns, until_ns)
+        self._plan()
+
     def power_cycle(self, t_ns: int) -> None:
         """Off and on again."""
         with self.disturbing(t_ns) as now_ns:

@@ -20,6 +20,9 @@ from microdrivers.fakes.world.settings import ToolsWorld
 _SEEDS_A_DRIVE = 10
 _HERE = 37
 
+_SERVED_HEARTBEAT_MS = 500
+"""Of drives that run as a program among others, watched by another one: a busy computer lets both wait."""
+
 
 @runtime_checkable
 class FineStageWorld(Protocol):
@@ -51,6 +54,7 @@ class _Settings(pydantic.BaseModel, extra="ignore", frozen=True):
 
     connection: Connection
     axes: dict[Literal["x", "y", "z"], _AxisSettings]
+    heartbeat_ms: int = pydantic.Field(default=100, ge=1)
 
 
 def _attach(request: EmulationRequest) -> Emulation:
@@ -80,7 +84,13 @@ def _attach(request: EmulationRequest) -> Emulation:
         name: _build_drive(request, world, name, axis, number)
         for number, (name, axis) in enumerate(settings.axes.items())
     }
-    return attach_nodes(request, settings.connection, [drive.node for drive in drives.values()], drives)
+    return attach_nodes(
+        request,
+        settings.connection,
+        [drive.node for drive in drives.values()],
+        drives,
+        served={"heartbeat_ms": max(settings.heartbeat_ms, _SERVED_HEARTBEAT_MS)},
+    )
 
 
 def _build_drive(

@@ -30,6 +30,8 @@ from microdrivers.devices.wire_log_format import LoggedSample, bytes_text, read_
 from microdrivers.fakes.wire.wire import Reply, Temper, Wire, forget_wire, register_wire
 
 _MOST_SHOWN = 5
+_BUS = "CAN "
+"""What the name of a bus begins with in a log; no device is called so."""
 
 _log = logging.getLogger(__name__)
 
@@ -179,10 +181,11 @@ class ReplayWorld:
         log = read_wire_log(self.file)
         devices: Mapping[str, Any] = request.rig["devices"]
         self.starts_anew = log.header.source == "fake"
+        traffic = _by_device(log.records)
         self.replays = {
             name: ReplayEmulator(requests)
-            for name, traffic in _by_device(log.records).items()
-            if name in devices and (requests := logged_requests(traffic))
+            for name, sent in traffic.items()
+            if name in devices and (requests := logged_requests(sent))
         }
         on_can = [name for name, section in devices.items() if _is_on_can(section)]
         if not self.replays and len(on_can) == len(devices):
@@ -190,6 +193,13 @@ class ReplayWorld:
                 f"CAN buses are not replayed, and {', '.join(on_can)} {'is' if len(on_can) == 1 else 'are'} on one",
                 file=str(self.file),
                 remedy="read the log: a frame is a line of its own, in candump's notation; or use --fake",
+            )
+        if traffic and all(name.startswith(_BUS) for name in traffic):
+            raise ConfigError(
+                f"the log holds nothing but frames of {', '.join(traffic)}, and CAN buses are not replayed",
+                file=str(self.file),
+                remedy="give a log of a run in which devices on serial lines were used too; or read this one: a frame "
+                "is a line of its own, in candump's notation",
             )
         if not self.replays:
             raise ConfigError(

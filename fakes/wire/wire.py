@@ -201,6 +201,8 @@ class Wire:
 
     def _fragments(self, data: bytes) -> list[bytes]:
         count = int(self._random.integers(1, self._temper.max_fragments + 1))
+        if count == 1:
+            return [data] if data else []
         cuts = sorted(int(cut) for cut in self._random.integers(0, len(data) + 1, size=count - 1))
         edges = [0, *cuts, len(data)]
         return [data[a:b] for a, b in itertools.pairwise(edges) if b > a]

@@ -215,8 +215,9 @@ def test_interfaces_that_are_not_there():
     with pytest.raises(LinkLost, match="nowhere") as caught:
         _open(interface="slcan", channel="/dev/nowhere", options={"sleep_after_open": 0.0})
     assert "cable" in caught.value.remedy
+    uninstalled = CanConnection(interface="virtual", channel="v").model_copy(update={"interface": "telepathy"})
     with pytest.raises(ConfigError, match="cannot use the interface 'telepathy'"):
-        _open(interface="telepathy")
+        CanAdapter(uninstalled, clock=SystemClock(), counters=CanCounters())
     with pytest.raises(ConfigError, match="refuses these settings") as settings:
         _open(interface="slcan", channel="/dev/nowhere@fast")
     assert settings.value.key == "connection"
@@ -256,7 +257,7 @@ class _ScriptedBus:
 
 def _adapter(monkeypatch: pytest.MonkeyPatch, bus: _ScriptedBus, interface: str, clock: Clock) -> CanAdapter:
     monkeypatch.setattr(CanAdapter, "_open", lambda self: bus)
-    return CanAdapter(CanConnection(interface=interface, channel="c"), clock=clock, counters=CanCounters())
+    return CanAdapter(CanConnection(interface=interface, channel="COM9"), clock=clock, counters=CanCounters())
 
 
 def test_garbage_error_frames_and_a_message(monkeypatch: pytest.MonkeyPatch):
@@ -277,7 +278,7 @@ def test_a_full_queue_is_no_lost_adapter(monkeypatch: pytest.MonkeyPatch):
         assert isinstance(adapter.explain(full), LinkTimeout)
     down = adapter.explain(can.CanOperationError("Network is down", errno.ENETDOWN))
     assert isinstance(down, LinkLost)
-    assert "sudo ip link set c up type can bitrate 500000" in down.remedy
+    assert "sudo ip link set COM9 up type can bitrate 500000" in down.remedy
 
 
 def test_kernel_stamps_become_times_of_the_rigs_clock(monkeypatch: pytest.MonkeyPatch):

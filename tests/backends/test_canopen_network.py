@@ -160,3 +160,19 @@ def test_event_driven_pdos_have_times_and_others_none():
 def test_a_mapping_word_tells_index_sub_and_bits(index: int, sub: int, bits: int):
     entry: Entry[int] = unsigned(index, sub, bits)
     assert (entry.mapping >> 16, entry.mapping >> 8 & 0xFF, entry.mapping & 0xFF) == (index, sub, bits)
+
+
+def test_a_computer_that_was_too_busy_to_beat_blames_nobody_else_first():
+    with LineBench() as bench:
+        heartbeats = bench.line.service(Heartbeats)
+        heartbeats.produce(0.05)
+        bench.clock.sleep(0.2)
+        in_time = bench.line.silence("no answer", 0.3)
+        assert "busy" not in in_time.what
+        heartbeats._last_ns -= 130_000_000  # as if it had not had its turn since
+        bench.clock.sleep(0.05)
+        late = bench.line.silence("no answer", 0.3)
+        assert "this computer is too busy: our heartbeat was 130 ms late" in late.what
+        assert "end other programs" in late.remedy
+        bench.clock.sleep(3.0)
+        assert bench.line.silence("no answer", 0.3).remedy == in_time.remedy

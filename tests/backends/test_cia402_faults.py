@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
-from microdrivers.core.errors import (
-    DeviceFault,
-    NotReached,
-)
+from microdrivers.core.errors import DeviceFault, LinkLost, NotReached
 from tests.backends.cia402_bench import Bench
 from tests.backends.cia402_peer import FAULT, SOD
 
@@ -180,3 +179,40 @@ def test_a_search_that_the_drive_gives_up():
         _later(bench, 0.5, give_up)
         with pytest.raises(DeviceFault, match="the drive has given the search up"):
             bench.stage.reference(["z"])
+
+
+# ---------------------------------------------------------------------- a busy computer
+
+
+def test_our_heartbeat_may_be_late_by_three_quarters_of_what_drives_allow():
+    with Bench(heartbeat_ms=100) as bench:
+        bench.opened()
+        begin_ns = bench.clock.now_ns()
+        bench.clock.sleep(1.0)
+        beats_ns = [t_ns for t_ns, who, frame in bench.medium.log if frame.id == 0x77F and t_ns > begin_ns]
+        assert max(after - before for before, after in pairwise(beats_ns)) < 30_000_000
+
+
+@pytest.mark.parametrize("busy", [True, False])
+def test_a_drive_that_missed_our_heartbeat_is_not_blamed_for_a_busy_computer(busy):
+    with Bench() as bench:
+        bench.referenced()
+        if busy:
+            bench.stage._line.lateness.note(bench.clock.now_ns(), 180_000_000)
+        _trip(bench, "y", 0x8130)
+        _settle(bench)
+        fault = bench.stage.fault
+        assert ("this computer is too busy: our heartbeat was 180 ms late" in fault.what) is busy
+        assert ("end other programs" in fault.remedy) is busy
+        assert fault.remedy.endswith("then clear_fault()")
+
+
+def test_a_silent_drive_may_be_one_that_a_busy_computer_did_not_hear():
+    with Bench() as bench:
+        bench.referenced()
+        bench.stage._line.lateness.note(bench.clock.now_ns(), 180_000_000)
+        move = bench.stage.start_move_to(x_um=600.0, y_um=600.0, speed_um_s=100.0)
+        _later(bench, 0.1, lambda: bench.medium.detach(bench.peers["y"]))
+        with pytest.raises(LinkLost, match=r"axis y \(node 12\).*this computer is too busy"):
+            move.wait()
+        assert "too busy" in next(event.reason for event in bench.events if event.kind == "link_lost")

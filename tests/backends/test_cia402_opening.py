@@ -9,6 +9,7 @@ import pytest
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.errors import (
+    BusyError,
     ConfigError,
     LinkTimeout,
     NotReferenced,
@@ -17,6 +18,7 @@ from microdrivers.core.errors import (
     UnsafeError,
 )
 from microdrivers.core.units import Range
+from microdrivers.fakes.can import Frame
 from tests.backends.cia402_bench import COUNTS, Bench
 from tests.backends.cia402_peer import ENABLED, SOD
 
@@ -212,3 +214,21 @@ def test_moves_before_the_reference_are_refused():
         with pytest.raises(NotReferenced, match="axis x"):
             bench.stage.move_to(x_um=1.0, z_um=1.0)
         assert bench.stage.move_to(z_um=1.0).on_target
+
+
+def test_a_bus_that_another_program_drives_is_left_alone():
+    """Where the interface can be shared, as SocketCAN's, two hosts would take each other's drives away."""
+    with Bench() as bench:
+        other = bench.medium.open_port()
+        beats = bench.clock.every(0.025, lambda: other.send(Frame(0x77F, b"\5")))
+        with pytest.raises(BusyError, match="another program drives CAN bus bench") as caught:
+            bench.stage.open()
+        assert caught.value.moved == "no"
+        assert bench.stage.link != "open"
+        written = [frame for _, who, frame in bench.medium.log if frame.id in (0x60B, 0x60C, 0x60D)]
+        assert {frame.data[0] & 0xE0 for frame in written} <= {0x40, 0x60}  # nothing but questions
+        assert not [frame for _, who, frame in bench.medium.log if frame.id in (0x000, 0x080)]
+        bench.stage.stop()  # at any time
+        beats.cancel()
+        bench.clock.sleep(2.5)
+        bench.opened()

@@ -61,7 +61,8 @@ def test_a_drive_that_restarts_in_a_move():
         assert bench.stage.read().y_um == 61.7
         assert bench.peers["y"].number(0x607D, 2) == 12_500
         bench.stage.reference(["y"])
-        assert bench.stage.move_to(x_um=0.0, y_um=-bench.truth_um("x"), speed_um_s=500.0).on_target
+        as_far_um = bench.stage.read().x_um
+        assert bench.stage.move_to(x_um=0.0, y_um=-as_far_um, speed_um_s=500.0).on_target
         assert bench.peers["y"].number(0x6083, 0) == 200_000  # it has forgotten what it was told before
 
 

@@ -219,7 +219,7 @@ def test_another_controller_at_an_address_is_refused(
 
 @pytest.mark.parametrize(
     ("change", "match"),
-    [({"id": "4"}, r"axis y, address 2: .* no axis '4'; it has 1"), ({"stage": "M-112"}, "axis y, address 2: .*M-112")],
+    [({"id": "B"}, r"axis y, address 2: .* no axis 'B'; it has 1"), ({"stage": "M-112"}, "axis y, address 2: .*M-112")],
 )
 def test_what_the_rig_file_and_one_controller_disagree_about_is_named(change: dict[str, str], match: str) -> None:
     rig = ChainRig(opened=False, y=change)
