@@ -62,7 +62,7 @@ def find_branches(
     """Split one indentation.
 
     The contact is where the force leaves its baseline, the reversals are where straight lines through the deformation
-    on either side meet, and contact is lost where the force returns to the baseline for good.
+    on either side meet, and contact is lost where the force returns to the baseline for good, be it before a reversal.
 
     Args:
         time_s: increasing.
@@ -89,6 +89,9 @@ def find_branches(
     if len(turns) == 1 and _holds(time_s, deformation_um, first, load_end):
         hold_end = n
     gone = _loss(force_uN, first, hold_end, force_sigma_uN)
+    slipped_off = _loss(force_uN, first, first, force_sigma_uN) if gone == hold_end < n else n
+    if slipped_off < hold_end:
+        gone, hold_end, load_end = (min(end, slipped_off) for end in (gone, hold_end, load_end))
     return Branches(
         approach=range(first),
         loading=range(first, load_end),

@@ -256,8 +256,14 @@ def _notes(record: IndentationRecord, prepared: Prepared) -> list[str]:
         notes.append(f"adhesion: the specimen pulls with up to {-pulled.min():.3g} µN, which the model does not have")
     if prepared.contact.seen == "nothing":
         notes.append("the record begins in contact: the contact point is that of the record's own zero")
-    if not len(prepared.branches.unloading):
+    full = len(prepared.excluded.get("saturated", ()))
+    if full:
+        notes.append(f"the sensor was at the end of its range in {full} samples, which are left out")
+    parts = prepared.branches
+    if parts.release_s is not None and parts.turns_s and parts.release_s < parts.turns_s[0]:
+        notes.append(f"contact was lost at {parts.release_s:.2f} s, while the deformation still grew")
+    if not len(parts.unloading):
         notes.append("the record has no unloading: only the loading is fitted")
-    elif prepared.branches.release_s is None:
+    elif parts.release_s is None:
         notes.append("the record ends in contact")
     return notes

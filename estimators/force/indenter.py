@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
-from microdrivers.core.contact_samples import DeformationSample, SpecimenEstimate, VisionForceSample
+from microdrivers.core.contact_samples import (
+    DeformationSample,
+    IndentationSample,
+    SpecimenEstimate,
+    VisionForceSample,
+)
 from microdrivers.core.samples import ForceSample, Frame, Sample
 from microdrivers.estimators.force.matcher import IndentationMatcher
 
@@ -52,8 +57,17 @@ class IndentationEstimator:
         if isinstance(sample, DeformationSample) and self._vision_force is not None:
             found += self._vision_force.update(sample)
         if isinstance(sample, DeformationSample | ForceSample):
-            for indentation in self.matcher.update(sample):
-                found.append(indentation)
-                if self._recursion is not None:
-                    found += self._recursion.update(indentation)
+            found += self._followed(self.matcher.update(sample))
+        return found
+
+    def finish(self) -> Iterable[Sample]:
+        """No more samples come; returns what was waiting for some, in order."""
+        return self._followed(self.matcher.finish())
+
+    def _followed(self, indentations: Iterable[IndentationSample]) -> list[Sample]:
+        found: list[Sample] = []
+        for indentation in indentations:
+            found.append(indentation)
+            if self._recursion is not None:
+                found += self._recursion.update(indentation)
         return found

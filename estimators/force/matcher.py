@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right, insort
-from collections import Counter
+from collections import Counter, deque
 from itertools import pairwise
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample, IndentationSample
 from microdrivers.core.samples import ForceSample, Sample
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
-from microdrivers.estimators.force.scatter import RunningScatter
+from microdrivers.estimators.force.scatter import ScatterOfMeans
 
 _SENSOR_FAULTS = ("DISCONNECTED", "SATURATED", "STALE")
+_REMEMBERED = 65536
+"""Frames: 36 min at 30 Hz."""
 
 
 class MatcherSettings(NamedTuple):
@@ -31,18 +33,26 @@ class MatcherSettings(NamedTuple):
     max_readings: int = 8192
 
 
+class GivenUp(NamedTuple):
+    """A frame that was not matched, and why; `force_uN` is where a saturated sensor stood, NaN for other reasons."""
+
+    t_ns: int
+    reason: str
+    force_uN: float
+
+
 class IndentationMatcher:
     """Deformations and forces in, indentations out, each with the mean force over the exposure of its frame.
 
     A frame waits until readings lie on either side of its exposure. If none lies within it, because the sensor is
     slower than that, the force at mid-exposure is interpolated between the two around it; nothing is extrapolated.
     How the two streams interleave changes nothing in what comes out; within the sensor's stream, readings may come
-    out of order by `lateness_s`.
+    out of order by `lateness_s`. The stated scatter of a force is that of means over as long as the exposure.
 
     `unmatched` counts the frames that were given up, by reason: LOST (the contact point was not seen), SATURATED,
     STALE, DISCONNECTED or INVALID (such a reading lies in the exposure, or beside it where one would have to
     interpolate), GAP (readings too far apart), UNBRACKETED (older than all readings), OVERFLOW (too many were
-    waiting), OUT_OF_ORDER (older than a frame that has been dealt with).
+    waiting), OUT_OF_ORDER (older than a frame that has been dealt with). `given_up` holds the newest of them.
 
     Args:
         settings: when a frame is matched.
@@ -53,6 +63,7 @@ class IndentationMatcher:
         self.settings = settings or MatcherSettings()
         self.device = device
         self.unmatched: Counter[str] = Counter()
+        self.given_up: deque[GivenUp] = deque(maxlen=_REMEMBERED)
         self.late_readings = 0
         self._lateness_ns = round(self.settings.lateness_s * NS_PER_S)
         self._max_gap_ns = round(self.settings.max_gap_s * NS_PER_S)
@@ -60,7 +71,7 @@ class IndentationMatcher:
         self._readings: list[ForceSample] = []
         self._newest_ns: int | None = None
         self._done_ns: int | None = None
-        self._scatter = RunningScatter()
+        self._scatter = ScatterOfMeans()
         self._scattered = 0
         self._seq = 0
 
@@ -79,8 +90,24 @@ class IndentationMatcher:
             self._take_frame(sample)
         elif isinstance(sample, ForceSample):
             self._take_reading(sample)
+        return self._completed(self._lateness_ns)
+
+    def finish(self) -> list[IndentationSample]:
+        """No more samples come: match the frames that wait only for readings that might be late.
+
+        Returns:
+            The last indentations, oldest first. Frames that end after the newest reading are UNBRACKETED.
+        """
+        matched = self._completed(0)
+        for frame in self._frames:
+            self._give_up(frame, "UNBRACKETED")
+            self._done_ns = frame.t_ns
+        self._frames.clear()
+        return matched
+
+    def _completed(self, lateness_ns: int) -> list[IndentationSample]:
         matched = []
-        while self._frames and self._is_complete(self._frames[0]):
+        while self._frames and self._is_complete(self._frames[0], lateness_ns):
             frame = self._frames.pop(0)
             found = self._match(frame)
             self._done_ns = frame.t_ns
@@ -92,12 +119,12 @@ class IndentationMatcher:
 
     def _take_frame(self, frame: DeformationSample) -> None:
         if self._done_ns is not None and frame.t_ns <= self._done_ns:
-            self.unmatched["OUT_OF_ORDER"] += 1
+            self._give_up(frame, "OUT_OF_ORDER")
             return
         insort(self._frames, frame, key=_instant)
         if len(self._frames) > self.settings.max_waiting:
-            self._done_ns = self._frames.pop(0).t_ns
-            self.unmatched["OVERFLOW"] += 1
+            self._done_ns = self._frames[0].t_ns
+            self._give_up(self._frames.pop(0), "OVERFLOW")
 
     def _take_reading(self, reading: ForceSample) -> None:
         if self._newest_ns is not None and reading.t_ns < self._newest_ns - self._lateness_ns:
@@ -110,51 +137,57 @@ class IndentationMatcher:
         if surplus > 0:
             self._forget(surplus)
 
-    def _is_complete(self, frame: DeformationSample) -> bool:
+    def _is_complete(self, frame: DeformationSample, lateness_ns: int) -> bool:
         """Whether no reading that matters can come any more."""
         if not frame.found:
             return True
-        return self._newest_ns is not None and self._newest_ns >= _end_ns(frame) + self._lateness_ns
+        return self._newest_ns is not None and self._newest_ns >= _end_ns(frame) + lateness_ns
 
     # ------------------------------------------------------------------ one frame
 
     def _match(self, frame: DeformationSample) -> IndentationSample | None:
         if not frame.found:
-            self.unmatched["LOST"] += 1
+            self._give_up(frame, "LOST")
             return None
         begin_ns, end_ns = 2 * frame.t_ns - _end_ns(frame), _end_ns(frame)
         first = bisect_left(self._readings, begin_ns, key=_instant)
         last = bisect_right(self._readings, end_ns, key=_instant)
-        before = bisect_right(self._readings, begin_ns, key=_instant) - 1
         after = bisect_left(self._readings, end_ns, key=_instant)
+        # Of an instant's several readings, any will do.
+        before = min(bisect_right(self._readings, begin_ns, key=_instant) - 1, after)
         if before < 0:
-            self.unmatched["UNBRACKETED"] += 1
+            self._give_up(frame, "UNBRACKETED")
             return None
         within = self._readings[first:last]
         around = self._readings[before : after + 1]
+        self._scatter.length_ns = end_ns - begin_ns
         self._settle(last)
         reason = _fault(within or around)
         if not reason and any(b.t_ns - a.t_ns > self._max_gap_ns for a, b in pairwise(around)):
             reason = "GAP"
         matched = None
         if reason:
-            self.unmatched[reason] += 1
+            self._give_up(frame, reason, _stood_at_uN(around) if reason == "SATURATED" else math.nan)
         else:
             matched = self._sample(frame, within, around[0], around[-1])
         self._forget(before)
         return matched
+
+    def _give_up(self, frame: DeformationSample, reason: str, force_uN: float = math.nan) -> None:
+        self.unmatched[reason] += 1
+        self.given_up.append(GivenUp(frame.t_ns, reason, force_uN))
 
     def _sample(
         self, frame: DeformationSample, within: list[ForceSample], before: ForceSample, after: ForceSample
     ) -> IndentationSample:
         if within:
             force_uN = sum(reading.force_uN for reading in within) / len(within)
-            spread = 1.0 / math.sqrt(len(within))
+            sigma_uN = self._scatter.sigma_of_mean(len(within))
             used = within
         else:
             share = (frame.t_ns - before.t_ns) / (after.t_ns - before.t_ns)
             force_uN = (1.0 - share) * before.force_uN + share * after.force_uN
-            spread = math.hypot(1.0 - share, share)
+            sigma_uN = math.hypot(1.0 - share, share) * self._scatter.sigma_of_mean(1)
             used = [before, after]
         seq, self._seq = self._seq, self._seq + 1
         return IndentationSample(
@@ -167,7 +200,7 @@ class IndentationMatcher:
             deformation_um=frame.deformation_um,
             deformation_sigma_um=frame.sigma_um,
             force_uN=force_uN,
-            force_sigma_uN=spread * self._scatter.sigma,
+            force_sigma_uN=sigma_uN,
             readings=len(within),
             frame_seq=frame.frame_seq,
         )
@@ -202,3 +235,9 @@ def _fault(readings: list[ForceSample]) -> str:
         if not math.isfinite(reading.force_uN):
             return "INVALID"
     return ""
+
+
+def _stood_at_uN(readings: list[ForceSample]) -> float:
+    """Where a sensor stood that was at the end of its range."""
+    full = [reading.raw_uN - reading.tare_uN for reading in readings if "SATURATED" in reading.flags]
+    return sum(full) / len(full) if full else math.nan

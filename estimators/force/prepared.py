@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from microdrivers.core.errors import DataError
+from microdrivers.core.errors import DataError, SaturatedData
 from microdrivers.estimators.force.branches import Branches, find_branches
 from microdrivers.estimators.force.joint import BASE, CONTACT, CONTACT_S, PARAMETERS, Prior
 from microdrivers.estimators.force.model import Array
@@ -20,6 +20,7 @@ LOADING, HOLD, UNLOADING = 0, 1, 2
 """Numbers of the branches in contact."""
 
 _FEWEST_IN_FIT = 10
+_MOSTLY = 0.5
 _NOISE_SCATTER = 5.0
 """Three relative standard deviations of an observed noise, times the root of the number of samples."""
 
@@ -125,7 +126,8 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         margins: left out besides, where the motion has not settled.
 
     Raises:
-        DataError: too few samples are left. NoContact: the force does not rise.
+        DataError: too few samples are left. NoContact: the force does not rise. SaturatedData: hardly a sample of
+            the loading lies within the sensor's range.
     """
     time_s = np.asarray(record.time_s, dtype=np.float64)
     full, unseen = saturated(record), lost(record)
@@ -156,6 +158,11 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         number[part.start : part.stop] = index
     used = np.flatnonzero(free)
     loading = int(np.sum(number[used] == LOADING))
+    if loading < _FEWEST_IN_FIT and np.mean(full[branches.loading.start : branches.loading.stop]) > _MOSTLY:
+        raise SaturatedData(
+            f"the sensor is at the end of its range nearly throughout the loading, and {loading} samples are left",
+            remedy="indent less deep or slower, or use a sensor with a wider range",
+        )
     if loading < _FEWEST_IN_FIT:
         raise DataError(
             f"{loading} samples of the loading are usable, at least {_FEWEST_IN_FIT} are needed",

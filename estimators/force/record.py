@@ -22,6 +22,7 @@ FLAT_RUN = 5
 CLEAR = 6.0
 """Standard deviations that are no noise."""
 
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 2e-5, 5.0
 _SOFTEST_PA, _HARDEST_PA = 150.0, 1e9
 _LARGEST_FORCE_UN = 1e5
 _PA_PER_UN_UM2 = 1e6
@@ -149,6 +150,8 @@ def _check_time(time_s: Array) -> None:
             remedy="sort the record and remove repeated samples",
         )
     usual = float(np.median(step))
+    if not _SHORTEST_STEP_S <= usual <= _LONGEST_STEP_S:
+        raise DataError(f"implausible units: samples come every {usual:.4g} s", remedy=_UNITS)
     longest = int(np.argmax(step))
     if step[longest] > LONGEST_GAP * usual:
         raise DataError(

@@ -64,7 +64,10 @@ class SpecimenRecursion:
 
     An estimate carries the flag LOADING or UNLOADING: the branch that its sample belongs to. The slip of eq. (26) and
     whatever else lies outside eq. (21) bias it: that shows in the prediction error, not in the covariance, which is
-    that of white noise.
+    that of white noise in the force. The noise of the fitted velocities is not in it, neither that it is alike in
+    neighbouring samples nor that it pulls b towards 0, nor is that of the contact point: with a strong damper, ±1.96
+    standard deviations hold the truth in 75 % to 90 % of indentations, without one in 92 % to 98 %
+    (`scripts/bench_specimen_recursion.py`). `identify` gives intervals that hold.
 
     Args:
         settings: how it forgets, and what it leaves out.

@@ -63,9 +63,12 @@ def structure_test(
     if blocks:
         means = left_over_uN[: blocks * _BLOCK].reshape(blocks, _BLOCK).mean(axis=1)
         structured = math.sqrt(max(float(np.mean(means**2)) - noise**2 / _BLOCK, 0.0))
-    significant = p_value < SIGNIFICANT_P or float(np.mean(left_over_uN**2)) > _EXCESS * noise**2
+    excess = float(np.mean(left_over_uN**2)) > _EXCESS * noise**2
+    significant = p_value < SIGNIFICANT_P or excess
     found = significant and structured > _MATERIAL * noise
-    figures = f"{structured:.2g} µN RMS of slow residual beside {noise:.2g} µN of noise, p = {p_value:.1g}"
+    # A short record in disorder may look white: then it is its size that tells.
+    how = "more than noise can be" if excess else f"p = {p_value:.1g}"
+    figures = f"{structured:.2g} µN RMS of slow residual beside {noise:.2g} µN of noise, {how}"
     if found:
         text = f"misfit: the residual has structure that this model does not have ({figures})"
     elif significant:

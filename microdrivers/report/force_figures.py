@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +13,12 @@ from matplotlib.figure import Figure
 from microdrivers.report.number_format import significant
 from microdrivers.report.svg import BLUE, INK, MOVING, ORANGE, SHADE, WIDTH_IN, inline_svg, page_style
 from microdrivers.results.force import ForceResult, ProtocolName
-from microdrivers.results.record import Trace
 
 Array = npt.NDArray[np.float64]
 
 _MOST_POINTS = 1500
+_LATE = 0.75
+"""Of the time: a peak later than this has its labels on its left."""
 _COLOURS = {"approach": MOVING, "loading": BLUE, "hold": INK, "unloading": ORANGE, "lost": MOVING}
 
 
@@ -45,9 +47,9 @@ def draw_force_figures(result: ForceResult) -> ForceFigures | None:
 def _trapezoid(result: ForceResult) -> str:
     """Deformation and force over time, and force over deformation."""
     traces = result.traces
-    time, depth, force = (np.array(values) for values in (traces.time_s, traces.deformation_um, traces.force_uN))
+    time, depth, force = (_array(values) for values in (traces.time_s, traces.deformation_um, traces.force_uN))
     figure = Figure(figsize=(WIDTH_IN, 3.6))
-    grid = figure.add_gridspec(2, 2, left=0.085, right=0.985, bottom=0.13, top=0.93, wspace=0.22, hspace=0.18)
+    grid = figure.add_gridspec(2, 2, left=0.085, right=0.985, bottom=0.13, top=0.93, wspace=0.28, hspace=0.18)
     upper, lower = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     loop = figure.add_subplot(grid[:, 1])
     for axes, values, label in ((upper, depth, "deformation (µm)"), (lower, force, "force (µN)")):
@@ -62,6 +64,7 @@ def _trapezoid(result: ForceResult) -> str:
 
 def _by_branch(axes: Axes, result: ForceResult, depth: Array, force: Array) -> None:
     branch = np.array(result.traces.branch)
+    axes.margins(y=0.1)
     for name, colour in _COLOURS.items():
         chosen = branch == name
         if not chosen.any():
@@ -81,9 +84,11 @@ def _by_branch(axes: Axes, result: ForceResult, depth: Array, force: Array) -> N
 def _pair(result: ForceResult, left: ProtocolName, right: ProtocolName, *, key: str) -> str:
     """Measured and fitted force over time for two protocols."""
     traces = result.traces
-    time, force = np.array(traces.time_s), np.array(traces.force_uN)
+    time, force = np.array(traces.time_s), _array(traces.force_uN)
     figure = Figure(figsize=(WIDTH_IN, 2.9))
     panels = figure.subplots(1, 2, sharey=True)
+    late = time[np.nanargmax(force)] > time[0] + _LATE * (time[-1] - time[0])
+    aside, side = (0.025, "left") if late else (0.985, "right")
     figure.subplots_adjust(left=0.085, right=0.985, bottom=0.16, top=0.91, wspace=0.08)
     for axes, name, letter in zip(panels, (left, right), "ab", strict=True):
         axes.set(title=f"({letter}) {name}", xlabel="time (s)", xlim=(time[0], time[-1]))
@@ -94,9 +99,9 @@ def _pair(result: ForceResult, left: ProtocolName, right: ProtocolName, *, key: 
             continue
         axes.plot(*_thinned(time, _array(fitted)), color=ORANGE)
         error = f"error {significant(result.protocols[name].error_percent, 3)} %"
-        axes.text(0.985, 0.95, error, ha="right", va="top", transform=axes.transAxes, color=ORANGE, fontweight="bold")
+        axes.text(aside, 0.95, error, ha=side, va="top", transform=axes.transAxes, color=ORANGE, fontweight="bold")
     panels[0].set_ylabel("force (µN)")
-    panels[0].text(0.985, 0.86, "measured", ha="right", va="top", transform=panels[0].transAxes, color=MOVING)
+    panels[0].text(aside, 0.86, "measured", ha=side, va="top", transform=panels[0].transAxes, color=MOVING)
     return inline_svg(figure, key=key, label=f"Measured and reconstructed force, {left} and {right}")
 
 
@@ -125,5 +130,5 @@ def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
     return x[::stride], y[::stride]
 
 
-def _array(trace: Trace) -> Array:
+def _array(trace: Sequence[float | None]) -> Array:
     return np.array([np.nan if value is None else value for value in trace], dtype=np.float64)

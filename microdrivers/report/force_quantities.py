@@ -8,6 +8,8 @@ from microdrivers.report.number_format import compact, significant, with_uncerta
 from microdrivers.results.force import PROTOCOLS, ForceResult, ProtocolName, ProtocolResult
 
 FACTOR_95 = 1.96
+K2_UNIT = "10⁻⁶ µN/µm³"
+_K2_SCALE = 1e6
 
 NAMES: dict[ProtocolName, str] = {
     "single": "one model for loading and unloading",
@@ -18,23 +20,42 @@ NAMES: dict[ProtocolName, str] = {
 }
 
 PAPER: dict[ProtocolName, tuple[str, str, str, str]] = {
-    "single": ("4.5161", "0.0001", "27.7200", "3.89 %"),
-    "unloading_springs": ("2.9577", "0.0001", "51.3317", "5.22 %"),
+    "single": ("4.5161", "100", "27.7200", "3.89 %"),
+    "unloading_springs": ("2.9577", "100", "51.3317", "5.22 %"),
     "loading_only": ("", "", "", "10.72 %"),
-    "slip_corrected": ("5.8781", "0.000038346", "1.1834", "3.6 %"),
+    "slip_corrected": ("5.8781", "38.346", "1.1834", "3.6 %"),
     "loading": ("", "", "", ""),
 }
-"""k1 (µN/µm), k2 (µN/µm³), b (µN·s/µm) and error, Bilen et al., section III.C, each from an embryo of its own."""
+"""k1 (µN/µm), k2 (10⁻⁶ µN/µm³), b (µN·s/µm) and error, Bilen et al., section III.C, each from an embryo of its own."""
+
+
+class Quantity(NamedTuple):
+    """A parameter as text; in brackets if the record does not determine it. `plus_minus`: half of its 95 % interval."""
+
+    value: str
+    plus_minus: str
+    weak: bool
+
+    @property
+    def shown(self) -> str:
+        """The value by itself."""
+        return f"({self.value})" if self.weak else self.value
+
+    @property
+    def text(self) -> str:
+        """In one line."""
+        line = f"{self.value} ± {self.plus_minus}" if self.plus_minus else self.value
+        return f"({line})" if self.weak else line
 
 
 class ProtocolRow(NamedTuple):
-    """One way to fit the model, as text; a value that the record does not determine is marked `weak`."""
+    """One way to fit the model, as text; `weak` says why the record does not determine what."""
 
     key: ProtocolName
     name: str
-    k1: str
-    k2: str
-    b: str
+    k1: Quantity
+    k2: Quantity
+    b: Quantity
     error: str
     noise: str
     weak: tuple[str, ...]
@@ -63,7 +84,7 @@ def _row(result: ForceResult, key: ProtocolName, fit: ProtocolResult) -> Protoco
         key=key,
         name=NAMES[key],
         k1=_number(fit.k1_uN_per_um, fit.k1_sigma_uN_per_um, weak="k1" in weak),
-        k2=_number(fit.k2_uN_per_um3, fit.k2_sigma_uN_per_um3, weak="k2" in weak),
+        k2=_number(fit.k2_uN_per_um3, fit.k2_sigma_uN_per_um3, weak="k2" in weak, scale=_K2_SCALE),
         b=_number(fit.b_uN_s_per_um, fit.b_sigma_uN_s_per_um, weak="b" in weak),
         error=f"{significant(fit.error_percent, 3)} %",
         noise="" if fit.noise_residual_ratio is None else f"{significant(fit.noise_residual_ratio, 2)} ×",
@@ -73,11 +94,9 @@ def _row(result: ForceResult, key: ProtocolName, fit: ProtocolResult) -> Protoco
     )
 
 
-def _number(value: float, sigma: float | None, *, weak: bool) -> str:
-    """A parameter with the half-width of its 95 % interval; in brackets if the record does not determine it."""
-    text = with_uncertainty(value, None if sigma is None else FACTOR_95 * sigma)
-    shown = f"{text.value} ± {text.plus_minus}" if text.plus_minus else text.value
-    return f"({shown})" if weak else shown
+def _number(value: float, sigma: float | None, *, weak: bool, scale: float = 1.0) -> Quantity:
+    text = with_uncertainty(scale * value, None if sigma is None else FACTOR_95 * scale * sigma)
+    return Quantity(text.value, text.plus_minus, weak)
 
 
 def truth_rows(result: ForceResult) -> list[TruthRow]:
@@ -88,7 +107,7 @@ def truth_rows(result: ForceResult) -> list[TruthRow]:
     fit, slip = result.protocols[result.best], result.slip
     rows = [
         ("k1", fit.k1_uN_per_um, truth.k1_uN_per_um, "µN/µm"),
-        ("k2", fit.k2_uN_per_um3, truth.k2_uN_per_um3, "µN/µm³"),
+        ("k2", _K2_SCALE * fit.k2_uN_per_um3, _K2_SCALE * truth.k2_uN_per_um3, f"× {K2_UNIT}"),
         ("b", fit.b_uN_s_per_um, truth.b_uN_s_per_um, "µN·s/µm"),
     ]
     if slip is not None and truth.slip_offset_um:
@@ -107,10 +126,12 @@ def _percent(value: float, truth: float) -> str:
 
 
 def slip_text(result: ForceResult) -> str:
-    """The slip that eq. (26) found, in words; empty if none was fitted."""
+    """The slip that eq. (26) found, in words; that it is not needed, if the best protocol has none; else empty."""
     slip = result.slip
     if slip is None:
         return ""
+    if result.best != "slip_corrected":
+        return "the best fit does without"
     offset = with_uncertainty(slip.offset_um, _half(slip.offset_sigma_um))
     rate = with_uncertainty(slip.rate_per_s, _half(slip.rate_sigma_per_s))
     return (

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from microdrivers.report.force_quantities import excluded_text, protocol_rows, slip_text, truth_rows
-from microdrivers.report.number_format import compact, significant
+from microdrivers.report.force_quantities import FACTOR_95, K2_UNIT, excluded_text, protocol_rows, slip_text, truth_rows
+from microdrivers.report.number_format import compact, significant, with_uncertainty
 from microdrivers.report.page import created, page
 from microdrivers.results.force import ForceResult
 
@@ -41,12 +41,14 @@ def force_report_html(result: ForceResult) -> str:
         rows=protocol_rows(result),
         best=next(row for row in protocol_rows(result) if row.best),
         truths=truth_rows(result),
+        k2_unit=K2_UNIT,
         slip=slip_text(result),
         excluded=excluded_text(result),
         samples=len(result.traces.time_s),
         pressed=f"{significant(setup.deepest_um, 4)} µm, {significant(setup.largest_force_uN, 4)} µN, "
         f"{compact(setup.speed_um_s)} µm/s",
         scale=_scale(result),
+        drift=_drift(result),
         noise=f"{significant(result.deformation_sigma_um, 2)} µm, {significant(result.force_sigma_uN, 2)} µN",
         vision="" if check is None else significant(check.error_percent, 2),
         speed="" if result.largest_speed_um_s is None else significant(result.largest_speed_um_s, 3),
@@ -63,3 +65,12 @@ def _scale(result: ForceResult) -> str:
     if sigma:
         shown += f" ± {significant(100.0 * 1.96 * sigma / setup.scale_px_per_um, 2)} %"
     return f"{shown} px/µm, by {setup.scale_source}"
+
+
+def _drift(result: ForceResult) -> str:
+    setup = result.setup
+    if setup.image_drift_um_s is None:
+        return ""
+    sigma = setup.image_drift_sigma_um_s
+    rate = with_uncertainty(1e3 * setup.image_drift_um_s, None if sigma is None else FACTOR_95 * 1e3 * sigma)
+    return f"{rate.value} ± {rate.plus_minus} nm/s of the picture against the probe’s encoder, taken off"

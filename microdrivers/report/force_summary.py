@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 
-from microdrivers.report.force_quantities import excluded_text, protocol_rows, slip_text, truth_rows
+from microdrivers.report.force_quantities import K2_UNIT, excluded_text, protocol_rows, slip_text, truth_rows
 from microdrivers.report.number_format import compact, significant
 from microdrivers.report.page import created, run_kind
 from microdrivers.results.force import ForceResult
@@ -38,9 +38,9 @@ def _heading(result: ForceResult) -> list[str]:
 
 
 def _protocols(result: ForceResult) -> list[str]:
-    rows = [["", "k1 (µN/µm)", "k2 (µN/µm³)", "b (µN·s/µm)", "error", "paper"]]
+    rows = [["", "k1 (µN/µm)", f"k2 ({K2_UNIT})", "b (µN·s/µm)", "error", "paper"]]
     rows += [
-        [f"{'*' if row.best else ' '} {row.key}", row.k1, row.k2, row.b, row.error, row.paper[3]]
+        [f"{'*' if row.best else ' '} {row.key}", row.k1.text, row.k2.text, row.b.text, row.error, row.paper[3]]
         for row in protocol_rows(result)
     ]
     lines = _table(rows)
@@ -68,7 +68,7 @@ def _performance(result: ForceResult) -> list[str]:
     slip = slip_text(result)
     if slip and result.best == "slip_corrected":
         rows.append(("Slip", slip))
-    rows.append(("Misfit", result.misfit.text))
+    rows.append(("Residual", result.misfit.text))
     check = result.vision_check
     if check is not None:
         rows.append(

@@ -104,14 +104,14 @@ class VisionCheck(Record):
 
 
 class ForceTraces(Record):
-    """One value a sample: what figures 9–11 are drawn from.
+    """One value a frame: what figures 9–11 are drawn from. None where nothing was measured.
 
     `branch` is approach, loading, hold, unloading or lost. `fitted_uN` by protocol; `check_*` of the fresh indentation.
     """
 
     time_s: list[float]
-    deformation_um: list[float]
-    force_uN: list[float]
+    deformation_um: Trace
+    force_uN: Trace
     branch: list[str]
     fitted_uN: dict[str, Trace]
     check_time_s: list[float]
@@ -139,6 +139,7 @@ class Setup(Record):
     """How the specimen was indented and seen.
 
     `scale_source`: the probe's own travel, an optical calibration, or a recording that states µm.
+    `image_drift_um_s`: of the picture along the probing direction, as a probe that has come back shows it; taken off.
     """
 
     sensor: str
@@ -152,6 +153,8 @@ class Setup(Record):
     deepest_um: float
     largest_force_uN: float
     tare_uN: float | None
+    image_drift_um_s: float | None = None
+    image_drift_sigma_um_s: float | None = None
 
 
 class ForceResult(Record):

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.samples import ForceSample, PoseSample, Sample, ZoomSample
 from microdrivers.devices.base import Device, DeviceInfo
 from microdrivers.devices.camera import Camera
@@ -33,13 +31,6 @@ def unreferenced_axes(device: Device[Any]) -> list[str]:
         return []
     known = device.referenced
     return [axis for axis in device.reference_order if not known[axis]]
-
-
-def fault_remedy(error: MicrodriversError, file: Path, device: str) -> str:
-    """What to do about a fault of a device that answers, with the command that clears it where it can be cleared."""
-    if "clear_fault()" not in error.remedy:
-        return error.remedy
-    return f"{error.remedy}; to clear it: microdrivers clear-fault {file} {device}"
 
 
 def state_text(device: Device[Any], sample: Sample | None) -> str:

@@ -18,7 +18,7 @@ from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.rig import Rig
 from microdrivers.routines.bus_check import buses_of, check_bus
 from microdrivers.routines.camera_check import STAMP_LIMIT_NS, check_camera
-from microdrivers.routines.device_state import fault_remedy, identity_text, state_text, unreferenced_axes
+from microdrivers.routines.device_state import identity_text, state_text, unreferenced_axes
 from microdrivers.routines.findings import DeviceDiagnosis, Diagnosis
 from microdrivers.routines.guard_check import check_guards
 from microdrivers.routines.progress import Progress
@@ -76,8 +76,10 @@ def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None
         except MicrodriversError as error:
             found.failed(error)
         if device.fault is not None:
-            found.problem(f"the device is at fault: {device.fault.what}", fault_remedy(device.fault, file, name))
+            found.problem(f"the device is at fault: {device.fault.what}", device.fault.remedy)
     check_guards(rig, diagnoses)
+    for found in diagnoses:
+        found.say_commands(file)
     buses = []
     for bus, devices in buses_of(rig.devices.values()).items():
         if progress is not None:
@@ -167,7 +169,7 @@ def _check_state(rig: Rig, device: Device[Any], sample: Sample, found: DeviceDia
                 unit = device.axes[axis].unit
                 found.problem(
                     f"axis {axis} is at {position:.6g} {unit}, outside its limits {device.limits[axis]} {unit}",
-                    f"check travel_um or travel_deg of axis {axis} in the rig file, then reference the axis again",
+                    f"check travel_um or travel_deg of axis {axis} in the rig file, then again reference([{axis!r}])",
                 )
 
 
@@ -202,7 +204,9 @@ def _check_line(counters: Mapping[str, int], found: DeviceDiagnosis) -> None:
 def _check_motion(stage: Stage[Any], found: DeviceDiagnosis) -> None:
     for axis in _linear_axes(stage):
         if not stage.referenced[axis]:
-            found.warn(f"axis {axis} was not moved: it is not referenced", "reference it, then run the doctor again")
+            found.warn(
+                f"axis {axis} was not moved: it is not referenced", f"reference([{axis!r}]), then run the doctor again"
+            )
             continue
         home = _pose(stage)[axis]
         beside = [goal for goal in (home + STEP_UM, home - STEP_UM) if goal in stage.limits[axis]]

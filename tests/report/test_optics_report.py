@@ -9,6 +9,9 @@ from microdrivers.estimators.optics import student_factor
 from microdrivers.report.number_format import with_uncertainty
 from microdrivers.report.optics_report import optics_report_html, write_optics_report
 
+# The pages are made once, by one worker.
+pytestmark = pytest.mark.xdist_group("optics report")
+
 CASES = {
     "zoom change": {},
     "interrupted, real": {

@@ -26,9 +26,11 @@ class Calibration:
     result: OpticsResult
     rig: Rig
     truth: Any
+    judge: Callable[[OpticsRun], tuple[OpticsResult, Any]]
+    """The result of a run, or of a part of it, and the truth of that."""
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def calibrate():
     """Run a calibration on the emulated workstation, some of whose drivers may be replaced."""
 
@@ -52,8 +54,13 @@ def calibrate():
             source = CircleExperiment(rig, CircleSettings(**settings))
             collector = OpticsTruthCollector(source.bus)
             run = calibrate_optics(source, keep_samples=keep_samples, progress=progress)
+
+        def judge(run: OpticsRun) -> tuple[OpticsResult, Any]:
             known = {"source": "test", "clock": "simulated", "rig_name": "workstation"}
             result = build_result(run, describe_run(known, command="test", now=utc_now()))
-            return Calibration(run, result, rig, collector.compare(result, run.estimates))
+            return result, collector.compare(result, run.estimates)
+
+        result, truth = judge(run)
+        return Calibration(run, result, rig, truth, judge)
 
     return call

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.samples import ForceSample
-from microdrivers.routines.force.source import IndentationNames, IndentationSetup
+from microdrivers.routines.force.source import IndentationNames, IndentationSetup, Rests
 
 K1, K2, B = 3.0, 2e-4, 20.0
 SPEED_UM_S, DEPTH_UM, PERIOD_NS = 5.0, 60.0, 33_333_333
 
 
 class MadeUpSource:
-    """Publishes a ramp in and out at 30 Hz; `broken_off_at` raises in the middle of an indentation."""
+    """Publishes a ramp in and out at 30 Hz.
+
+    `broken_off_at` raises in the middle of an indentation; the contact point is `lost` in these frames; the sensor is
+    saturated from `range_uN` on; the picture drifts, as a tip at rest shows, which `stuck_uN` holds at the end.
+    """
 
     repeatable = True
 
-    def __init__(self, *, seed=0, broken_off_at=None, error=None, depth_noise_um=0.05, offset_uN=0.0):
+    def __init__(
+        self, *, seed=0, broken_off_at=None, error=None, depth_noise_um=0.05, offset_uN=0.0, lost=(), range_uN=1e9,
+        drift_um_s=None, stuck_uN=0.0,
+    ):  # fmt: skip
         self.bus = Bus()
         self.clock = SimulatedClock()
         self.names = IndentationNames("force", "deformation", None)
@@ -30,6 +39,10 @@ class MadeUpSource:
         self._error = error
         self._depth_noise_um = depth_noise_um
         self._offset_uN = offset_uN
+        self._lost = lost
+        self._range_uN = range_uN
+        self._drift_um_s = drift_um_s
+        self._stuck_uN = stuck_uN
         self._now_ns = 0
 
     def prepare(self, progress):
@@ -38,6 +51,7 @@ class MadeUpSource:
     def indent(self, begin, progress):
         begin()
         self.indentations += 1
+        begun_ns = self._now_ns
         turn_s = 3.0 + DEPTH_UM / SPEED_UM_S
         for k in range(round((2 * turn_s) * 1e9 / PERIOD_NS)):
             if k == self._broken_off_at:
@@ -48,7 +62,12 @@ class MadeUpSource:
             x_um = max(stage_um, 0.0)
             v = (SPEED_UM_S if loading else -SPEED_UM_S) if x_um > 0.0 else 0.0
             # The damper pulls the surface behind the tip: let it go with the tip, and the force end at zero.
-            self._publish(x_um, max(B * v + K1 * x_um + K2 * x_um**3, 0.0) + self._offset_uN)
+            pressed_uN = max(B * v + K1 * x_um + K2 * x_um**3, 0.0)
+            held_uN = self._stuck_uN if time_s > 2.0 * turn_s - 1.0 else 0.0
+            self._publish(x_um, pressed_uN + held_uN + self._offset_uN, k not in self._lost)
+        if self._drift_um_s is None:
+            return None
+        return Rests(begun_ns + 500_000_000, self._now_ns - 500_000_000, travel_um=0.0, travel_sigma_um=0.01)
 
     def finish(self):
         self.finished += 1
@@ -56,18 +75,23 @@ class MadeUpSource:
     def setup(self):
         return IndentationSetup("force", None, None, "made up", 0.25, 1e-5, None, SPEED_UM_S, 0.0)
 
-    def _publish(self, x_um, force_uN):
+    def _publish(self, x_um, force_uN, found):
         self._now_ns += PERIOD_NS
         seq = self._now_ns // PERIOD_NS
-        force_uN += 0.02 * self._random.standard_normal()
+        raw_uN = min(force_uN + 0.02 * self._random.standard_normal(), self._range_uN)
+        full = raw_uN >= self._range_uN
         self.bus.topic("force", ForceSample).publish(
-            ForceSample(t_ns=self._now_ns, device="force", seq=seq, force_uN=force_uN, raw_uN=force_uN)
-        )
-        seen_um = x_um + self._depth_noise_um * self._random.standard_normal()
+            ForceSample(
+                t_ns=self._now_ns, device="force", seq=seq, force_uN=math.nan if full else raw_uN, raw_uN=raw_uN,
+                flags=frozenset({"SATURATED"} if full else ()),
+            )
+        )  # fmt: skip
+        tip_um = (self._drift_um_s or 0.0) * self._now_ns / 1e9
+        seen_um = x_um + tip_um + self._depth_noise_um * self._random.standard_normal()
         self.bus.topic("deformation", DeformationSample).publish(
             DeformationSample(
-                t_ns=self._now_ns, device="deformation", seq=seq, deformation_um=seen_um,
-                sigma_um=self._depth_noise_um, tip_um=float("nan"), tip_sigma_um=float("nan"), u_px=0.0, v_px=0.0,
-                found=True, frame_seq=seq, exposure_ms=0.0,
+                t_ns=self._now_ns, device="deformation", seq=seq, deformation_um=seen_um if found else math.nan,
+                sigma_um=self._depth_noise_um, tip_um=tip_um, tip_sigma_um=0.03, u_px=0.0, v_px=0.0,
+                found=found, frame_seq=seq, exposure_ms=0.0,
             )
         )  # fmt: skip

@@ -2,11 +2,14 @@
 
 import pathlib
 
+import numpy as np
 import pytest
 
 from microdrivers.core.clock import utc_now
 from microdrivers.core.contact_samples import SpecimenEstimate, VisionForceSample
-from microdrivers.core.errors import DataError, LinkLost
+from microdrivers.core.errors import DataError, LinkLost, SaturatedData
+from microdrivers.estimators.force.identify import identify
+from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.recording.indentation_table import IndentationTable
 from microdrivers.report.force_report import force_report_html
 from microdrivers.report.force_summary import force_summary
@@ -122,6 +125,68 @@ def test_an_interruption_before_anything_touched_is_told():
     with pytest.raises(DataError):
         Characterisation(source).run()
     assert source.finished == 1
+
+
+def test_the_drift_of_the_picture_is_taken_off():
+    run = Characterisation(MadeUpSource(drift_um_s=0.01)).run(check=False)
+    assert run.first.drift.rate_um_s == pytest.approx(0.01, abs=1e-6)
+    drifted = [
+        sample.deformation_um - frame.deformation_um
+        for sample, frame in zip(run.first.samples, run.first.frames, strict=True)
+    ]
+    assert drifted[-1] - drifted[0] == pytest.approx(0.01 * (run.record.time_s[-1] - run.record.time_s[0]))
+    result = result_of(run)
+    assert result.setup.image_drift_um_s == run.first.drift.rate_um_s
+    # The offset of a slip is no better known than the drift.
+    drift_um = result.setup.image_drift_sigma_um_s * run.identification.contact_duration_s
+    assert result.slip.offset_sigma_um > drift_um > 0.0
+    assert result.slip.offset_sigma_um > run.identification.slip.sigma_offset_um
+    assert "of the picture against the probe" in force_report_html(result)
+
+
+def test_a_tip_that_is_held_at_the_end_tells_no_drift():
+    run = Characterisation(MadeUpSource(drift_um_s=0.01, stuck_uN=5.0)).run(check=False)
+    assert run.first.drift is None
+    assert run.first.frames == run.first.samples
+    assert result_of(run).setup.image_drift_um_s is None
+
+
+def test_frames_without_a_track_are_kept_and_marked():
+    lost = range(250, 280)
+    run = Characterisation(MadeUpSource(lost=lost)).run(check=False)
+    assert np.flatnonzero(run.record.lost).tolist() == list(lost)
+    assert len(run.record.time_s) == len(run.first.samples) + len(lost)
+    assert sum("LOST" in frame.flags for frame in run.first.frames) == len(lost)
+    result = result_of(run)
+    assert result.excluded_samples["frames_lost"] == len(lost)
+    assert result.traces.deformation_um[250] is None
+    assert result.protocols["single"].k1_uN_per_um == pytest.approx(K1, rel=0.05)
+    assert any("not seen in 30 frames" in note for note in result.notes)
+    assert "<svg" in force_report_html(result)
+
+
+def test_a_sensor_at_the_end_of_its_range_is_said():
+    run = Characterisation(MadeUpSource(range_uN=250.0)).run(check=False)
+    assert np.sum(run.record.saturated) == run.first.unmatched["SATURATED"] > 30
+    result = result_of(run)
+    assert result.excluded_samples["saturated"] == run.first.unmatched["SATURATED"]
+    assert any("end of its range" in note for note in result.notes)
+    assert result.protocols["single"].k1_uN_per_um == pytest.approx(K1, rel=0.05)
+
+
+def test_a_sensor_that_is_at_its_end_nearly_always_is_refused():
+    with pytest.raises(SaturatedData, match="end of its range"):
+        Characterisation(MadeUpSource(range_uN=100.1)).run(check=False)
+
+
+def test_what_was_measured_is_identified_to_the_last_sample():
+    table = IndentationTable(REAL)
+    run = Characterisation(IndentationPlayback(table)).run()
+    assert len(run.record.time_s) == len(table)
+    columns = (np.array(table.column(name)) for name in ("time_s", "indentation_um", "force_uN"))
+    found = identify(IndentationRecord(*columns))
+    for name, fit in run.identification.protocols.items():
+        assert fit.error_percent == pytest.approx(found.protocols[name].error_percent, rel=1e-3), name
 
 
 def test_a_real_indentation_is_fitted_as_well_as_it_can_be():

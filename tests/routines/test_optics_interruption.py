@@ -31,13 +31,28 @@ class InterruptAt:
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("frame", [20, 46, 80])
-def test_ctrl_c_on_the_circle_stops_all_axes_and_keeps_what_was_measured(calibrate, frame):
+def interrupt(calibrate, frame, **options):
+    """A run that is interrupted at a frame, and the emulator on its stage's wire."""
     emulators = []
     calibration = calibrate(
-        progress=InterruptAt(frame), prepare=lambda rig: emulators.append(wire_named("sample_stage").emulator)
+        progress=InterruptAt(frame),
+        prepare=lambda rig: emulators.append(wire_named("sample_stage").emulator),
+        **options,
     )
-    speeds, stops = stage_state(calibration.rig, emulators[0])
+    return calibration, emulators[0]
+
+
+LATE = 58
+
+
+@pytest.fixture(scope="module", params=[11, 12])
+def interrupted(request, calibrate):
+    """A run that was interrupted some frames after the zoom change."""
+    return interrupt(calibrate, LATE, seed=request.param)
+
+
+def assert_stopped_and_kept(calibration, emulator, frame):
+    speeds, stops = stage_state(calibration.rig, emulator)
     assert speeds == pytest.approx([0, 0, 0], abs=1e-9)
     assert stops
     assert not calibration.result.complete
@@ -45,17 +60,31 @@ def test_ctrl_c_on_the_circle_stops_all_axes_and_keeps_what_was_measured(calibra
     assert any("interrupted" in note for note in calibration.result.notes)
 
 
+@pytest.mark.parametrize("frame", [20, 46])
+def test_ctrl_c_on_the_circle_stops_all_axes_and_keeps_what_was_measured(calibrate, frame):
+    assert_stopped_and_kept(*interrupt(calibrate, frame), frame)
+
+
+after_the_change = pytest.mark.xdist_group("interrupted after the zoom change")
+
+
+@after_the_change
+def test_so_does_ctrl_c_at_the_new_zoom(interrupted):
+    assert_stopped_and_kept(*interrupted, LATE)
+
+
 OLD_ZOOM, NEW_ZOOM = 0.9, 1.2
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@after_the_change
 @pytest.mark.parametrize(
     ("frame", "zoom"), [(47, OLD_ZOOM), (49, OLD_ZOOM), (51, OLD_ZOOM), (54, OLD_ZOOM), (58, NEW_ZOOM)]
 )
-def test_ctrl_c_soon_after_the_zoom_change_keeps_the_calibration_that_is_well_founded(calibrate, frame, zoom, seed):
+def test_ctrl_c_soon_after_the_zoom_change_keeps_the_calibration_that_is_well_founded(interrupted, frame, zoom):
     """The zoom changes after frame 45; fewer than 57 frames are refused beforehand, so no interruption may use them."""
-    calibration = calibrate(seed=seed, progress=InterruptAt(frame))
-    result, truth = calibration.result, calibration.truth
+    calibration, _ = interrupted
+    run = calibration.run._replace(estimates=calibration.run.estimates[:frame])
+    result, truth = calibration.judge(run)
     assert not result.complete
     assert result.zoom == result.valid_for.zoom == pytest.approx(zoom, rel=1e-3)
     assert truth.zoom == pytest.approx(zoom, rel=5e-3)
@@ -63,7 +92,7 @@ def test_ctrl_c_soon_after_the_zoom_change_keeps_the_calibration_that_is_well_fo
     assert abs(result.scale_px_per_um - truth.scale_px_per_um) <= half_width
     low, high = result.tilt.interval_deg
     assert low <= truth.tilt_deg <= high
-    since = sum(estimate.frame_index > 44 for estimate in calibration.run.estimates)
+    since = sum(estimate.frame_index > 44 for estimate in run.estimates)
     ended = [note for note in result.notes if f"ended {since} frames after the zoom began to change" in note]
     assert bool(ended) == (zoom == OLD_ZOOM)
     assert (result.zoom_change is None) == (zoom == OLD_ZOOM)
@@ -88,9 +117,9 @@ def test_too_short_an_arc_is_no_calibration(calibrate):
         calibrate(progress=InterruptAt(14), degrees_per_frame=1.0)
 
 
-@pytest.mark.parametrize("write", [40, 90, 150, 230, 333, 480, 620])
+@pytest.mark.parametrize("write", [40, 90, 125, 150, 230, 262, 300])
 def test_ctrl_c_in_the_middle_of_an_exchange_stops_all_axes(calibrate, monkeypatch, write):
-    """At any request on any line: while referencing, finding the target, streaming, changing the zoom."""
+    """At any request on any line: while referencing, finding the target, streaming, changing the zoom, and after."""
     written, seen = [0], {}
     honest = Wire.write
 
@@ -105,7 +134,7 @@ def test_ctrl_c_in_the_middle_of_an_exchange_stops_all_axes(calibrate, monkeypat
 
     monkeypatch.setattr(Wire, "write", interrupting)
     with suppress(KeyboardInterrupt, IllConditioned):  # perhaps too little was measured for a result
-        calibrate(prepare=prepare)
+        calibrate(prepare=prepare, change_after_frame=12, frames=40)
     assert written[0] > write
     speeds, stops = stage_state(seen["rig"], seen["emulator"])
     assert speeds == pytest.approx([0, 0, 0], abs=1e-9)

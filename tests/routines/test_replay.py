@@ -17,12 +17,12 @@ from microdrivers.routines.force import (
     Characterisation,
     IndentationReplay,
     PressExperiment,
-    PressSettings,
     build_result,
 )
 from microdrivers.routines.force.source import READY
 from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsReplay, calibrate_optics
 from microdrivers.routines.provenance import describe_run
+from tests.routines.small_rig import SHORT, small_rig
 
 
 def bits(estimates):
@@ -61,6 +61,16 @@ def test_the_estimator_sees_what_it_saw(calibrated):
         assert list(recording.arrivals["optics"]) == run.arrivals
         again = calibrate_optics(OpticsReplay(recording), keep_samples=True)
     assert [sample.order for sample in again.recorded] == run.arrivals
+
+
+def test_the_order_of_arrival_is_known_without_reading_frames(calibrated, monkeypatch):
+    run, file = calibrated
+    with Recording(file) as recording:
+        sizes = []
+        read = recording._scan.read_chunk
+        monkeypatch.setattr(recording._scan, "read_chunk", lambda place: sizes.append(place.length) or read(place))
+        assert list(recording.arrivals["optics"]) == run.arrivals
+    assert 0 < max(sizes) < 100_000 < 640 * 480
 
 
 def test_a_recording_without_a_calibration_is_refused(tmp_path):
@@ -116,7 +126,7 @@ def test_those_of_an_inbox_come_as_they_arrived_there(tmp_path):
 
     def play(replay):
         replay.up_to(1)
-        replay.as_arrived("host", 7)
+        replay.as_arrived("host", ("stage",), 7)
 
     seen, replay = published(recording, play)
     assert [order for order in seen if order in (1, 4, 2, 6)] == [1, 4, 2, 6]
@@ -126,9 +136,29 @@ def test_those_of_an_inbox_come_as_they_arrived_there(tmp_path):
 
 def test_what_an_inbox_had_and_the_file_has_not_is_counted(tmp_path):
     recording = poses(tmp_path / "a.mcap", [0, 1, 3, 4], arrivals=[0, 1, 2, 3])
-    seen, replay = published(recording, lambda replay: replay.as_arrived("host", None))
-    assert seen == [0, 1, 3, 4]
+    seen, replay = published(recording, lambda replay: replay.as_arrived("host", ("stage",), None))
+    assert seen == [0, 1, 3]
     assert replay.missing == 1
+
+
+def test_what_came_before_an_inbox_listened_and_after_it_was_closed_is_not_for_it(tmp_path):
+    recording = poses(tmp_path / "a.mcap", range(8), arrivals=[3, 4, 5])
+
+    def play(replay):
+        replay.up_to(1)
+        replay.as_arrived("host", ("stage",), 5)  # a note came before the inbox was closed
+
+    seen, replay = published(recording, play)
+    assert seen == [0, 3, 4, 5]
+    replay.up_to(None)
+    assert seen == [0, 3, 4, 5, 6, 7]
+
+
+def test_where_a_recording_was_cut_off_the_order_of_the_bus_will_do(tmp_path):
+    recording = poses(tmp_path / "a.mcap", range(8), arrivals=[1, 2])
+    recording.complete = False
+    seen, _ = published(recording, lambda replay: replay.as_arrived("host", ("stage",), 7))
+    assert seen == [1, 2, 3, 4, 5, 6]
 
 
 def test_the_pace_is_that_of_the_times(tmp_path):
@@ -152,7 +182,7 @@ def indented(tmp_path_factory):
         ) as rig,
         recorder_of(file, rig) as recorder,
     ):
-        source = PressExperiment(rig, PressSettings(speed_um_s=20.0, depth_um=30.0, rest_s=0.5))
+        source = PressExperiment(rig, SHORT)
         characterisation = Characterisation(
             source, on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals)
         )
@@ -160,18 +190,7 @@ def indented(tmp_path_factory):
     return run, file
 
 
-def small_rig(folder):
-    """The workstation with a camera that sees the middle of the view alone, and slower force readings."""
-    text = shipped_rig().read_text()
-    section = text.index("  camera_fine:")
-    text = text[:section] + text[section:].replace("[640, 480]", "[320, 240]", 1)
-    section = text.index("  probe_force:")
-    text = text[:section] + text[section:].replace("rate_hz: 1000", "rate_hz: 200", 1)
-    file = folder / "workstation.yaml"
-    file.write_text(text)
-    return file
-
-
+@pytest.mark.xdist_group("recorded_press")
 def test_a_recorded_characterisation_gives_the_same_bits(indented):
     run, file = indented
     with Recording(file) as recording:
@@ -186,6 +205,7 @@ def test_a_recorded_characterisation_gives_the_same_bits(indented):
     assert build_result(again, provenance) == build_result(run, provenance)
 
 
+@pytest.mark.xdist_group("recorded_press")
 def test_the_experiment_notes_what_its_replay_needs(indented):
     _, file = indented
     with Recording(file) as recording:
@@ -195,6 +215,7 @@ def test_the_experiment_notes_what_its_replay_needs(indented):
     assert frames > 100
 
 
+@pytest.mark.xdist_group("recorded_press")
 def test_the_specimen_was_identified(indented):
     run, _ = indented
     fit = run.identification.protocols["slip_corrected"]

@@ -22,6 +22,7 @@ from microdrivers.routines.analysis.results_table import ResultsTable
 _THREAD_LIMITS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _PER_WORKER = 2
 """Recordings handed to each worker ahead of time."""
+SCHEDULER_TIMEOUT = "10s"
 
 Analyse = Callable[[str], Row]
 
@@ -171,7 +172,7 @@ def _end_with(watched: connection.Connection) -> None:
 def _on_cluster(files: Sequence[str], address: str, analyse: Analyse) -> Iterator[Row]:
     distributed = optional_module("distributed", extra="cluster")
     try:
-        client = distributed.Client(address, timeout="10s", set_as_default=False)
+        client = distributed.Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"no Dask scheduler answers at {address!r}: {error}", remedy="check the address, and that it runs"

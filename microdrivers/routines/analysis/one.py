@@ -20,8 +20,9 @@ Row = dict[str, str | int | float | bool | None]
 """A cell for each of `COLUMNS`; None where a figure is undefined."""
 
 COLUMNS: Mapping[str, type] = {
-    "file": str, "kind": str, "error": str, "losses": int, "created_utc": str, "rig": str, "seed": int,
-    "complete": bool, "frames": int, "lost_frames": int, "unmatched_frames": int,
+    "file": str, "kind": str, "error": str, "losses": int, "dropped": int, "unsorted": int,
+    "created_utc": str, "rig": str, "seed": int, "complete": bool,
+    "frames": int, "lost_frames": int, "unmatched_frames": int,
     "scale_px_per_um": float, "scale_sigma_px_per_um": float, "zoom": float, "magnification": float,
     "angle_deg": float, "angle_sigma_deg": float, "tilt_low_deg": float, "tilt_high_deg": float, "view": str,
     "prediction_error_px": float, "iterations_to_0p1_px": int,
@@ -45,6 +46,8 @@ def analyse_recording(file: str) -> Row:
         with _one_thread(), Recording(Path(file)) as recording:
             row |= _origin(recording.header)
             row["losses"] = len(recording.losses)
+            row["dropped"] = sum(topic.dropped for topic in recording.topics.values())
+            row["unsorted"] = sum(topic.unsorted for topic in recording.topics.values())
             row |= _analyse(recording)
     except MicrodriversError as error:
         row["error"] = f"{type(error).__name__}: {str(error).splitlines()[0]}"

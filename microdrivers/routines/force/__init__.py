@@ -2,7 +2,8 @@
 
 from microdrivers.routines.force.characterisation import Characterisation, ForceRun
 from microdrivers.routines.force.playback import IndentationPlayback
-from microdrivers.routines.force.press import PressExperiment, PressSettings
+from microdrivers.routines.force.press import PressExperiment
+from microdrivers.routines.force.press_settings import PressSettings
 from microdrivers.routines.force.replay import IndentationReplay
 from microdrivers.routines.force.result import build_result
 from microdrivers.routines.force.sight import Sight

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from microdrivers.core.bus import Topic
 from microdrivers.core.contact_samples import (
@@ -15,10 +13,9 @@ from microdrivers.core.contact_samples import (
     SpecimenEstimate,
     VisionForceSample,
 )
-from microdrivers.core.errors import NoContact
+from microdrivers.core.errors import CalibrationError, DataError, MicrodriversError, NoContact
 from microdrivers.core.inbox import EstimatorHost, Inbox
 from microdrivers.core.samples import ForceSample, Frame, Sample
-from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.force.identify import Identification, identify
 from microdrivers.estimators.force.indenter import IndentationEstimator
 from microdrivers.estimators.force.matcher import IndentationMatcher
@@ -26,6 +23,8 @@ from microdrivers.estimators.force.model import SpecimenModel, slipped_um
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.force.recursion import SpecimenRecursion
 from microdrivers.estimators.force.vision_force import VisionForce
+from microdrivers.estimators.vision.image_drift import ImageDrift
+from microdrivers.routines.force.frames import all_frames, drift_of, record_of, without_drift
 from microdrivers.routines.force.source import FrameTracker, IndentationSetup, IndentationSource, host_name
 from microdrivers.routines.progress import Progress, SilentProgress
 
@@ -35,6 +34,9 @@ class Indentation(NamedTuple):
 
     Attributes:
         samples: deformation and force, one a matched frame. unmatched: frames without, by reason.
+        frames: all frames in order of time, those without a deformation or a force flagged with the reason; the
+            picture's drift is taken off.
+        drift: of the picture; None if it is not known.
         deformations: one a frame. estimates: of the recursion. forces: read from the camera.
         arrivals: bus-wide order numbers in the order in which the estimators saw the samples. recorded: these samples,
             if asked for.
@@ -42,6 +44,8 @@ class Indentation(NamedTuple):
 
     samples: list[IndentationSample]
     unmatched: Counter[str]
+    frames: list[IndentationSample]
+    drift: ImageDrift | None
     deformations: list[DeformationSample]
     estimates: list[SpecimenEstimate]
     forces: list[VisionForceSample]
@@ -52,10 +56,11 @@ class Indentation(NamedTuple):
 class ForceRun(NamedTuple):
     """What a characterisation left behind; `check` is the fresh indentation, if there was one.
 
-    `complete` is False if it was interrupted.
+    `complete` is False if it ended early; `ended_by` says by what.
     """
 
     complete: bool
+    ended_by: str
     first: Indentation
     record: IndentationRecord
     identification: Identification
@@ -66,7 +71,8 @@ class ForceRun(NamedTuple):
 class Characterisation:
     """Presses, identifies, and presses again with the sensor ignored.
 
-    `first` and `check` hold what was measured even if `run` ends with an error. `on_host` is told the estimators' inbox
+    `first` and `check` hold what was measured even if `run` ends with an error, and `interrupted` tells whether it was
+    by Ctrl-C. `on_host` is told the estimators' inbox
     of each indentation once it is there, for who records the order of arrival.
     """
 
@@ -79,6 +85,9 @@ class Characterisation:
     ) -> None:
         self.first: Indentation | None = None
         self.check: Indentation | None = None
+        self.interrupted = False
+        self._record: IndentationRecord | None = None
+        self._identification: Identification | None = None
         self._source = source
         self._keep_samples = keep_samples
         self._on_host = on_host
@@ -90,34 +99,49 @@ class Characterisation:
 
         Raises:
             NoContact, IllConditioned and other DataError or CalibrationError: the record does not show or determine
-                a specimen. MicrodriversError: whatever the source raises.
+                a specimen. MicrodriversError: whatever the source raises. See `partial` for what is left then.
         """
-        progress = progress or SilentProgress()
-        source = self._source
-        complete, identification, record = True, None, None
         try:
-            tracker = source.prepare(progress)
-            self.first = self._indent(tracker, None, progress)
-            record = record_of(self.first.samples)
-            progress.step("identifying the specimen")
-            identification = identify(record)
-            if check and source.repeatable:
-                progress.step("a fresh indentation, with force from the camera alone")
-                model = after_slip(identification)
-                self.check = self._indent(tracker, model, progress)
+            self._experiment(progress or SilentProgress(), check=check)
         except KeyboardInterrupt:
-            complete = False
+            self.interrupted = True
         finally:
-            source.finish()
+            self._source.finish()
         if self.first is None:
             raise NoContact("interrupted before anything was measured", remedy="start again")
-        if record is None or identification is None:
-            record = record_of(self.first.samples)
-            identification = identify(record)
-        return ForceRun(complete, self.first, record, identification, self.check, source.setup())
+        return self._found("it was interrupted" if self.interrupted else "")
 
-    def _indent(self, tracker: FrameTracker | None, model: SpecimenModel | None, progress: Progress) -> Indentation:
-        """One indentation. An interruption during the first keeps it; see `run`."""
+    def partial(self, error: MicrodriversError) -> ForceRun | None:
+        """What had been measured before `run` ended with this error, identified; None if that tells nothing."""
+        if self.first is None or not self.first.frames:
+            return None
+        try:
+            return self._found(error.what)
+        except (DataError, CalibrationError):
+            return None
+
+    def _experiment(self, progress: Progress, *, check: bool) -> None:
+        source = self._source
+        tracker = source.prepare(progress)
+        self._indent(tracker, None, progress)
+        progress.step("identifying the specimen")
+        found = self._found("").identification
+        if check and source.repeatable:
+            progress.step("a fresh indentation, with force from the camera alone")
+            self._indent(tracker, after_slip(found), progress)
+
+    def _found(self, ended_by: str) -> ForceRun:
+        """What `first` says of the specimen."""
+        assert self.first is not None
+        if self._record is None or self._identification is None:
+            self._record = record_of(self.first.frames)
+            self._identification = identify(self._record)
+        return ForceRun(
+            not ended_by, ended_by, self.first, self._record, self._identification, self.check, self._source.setup()
+        )
+
+    def _indent(self, tracker: FrameTracker | None, model: SpecimenModel | None, progress: Progress) -> None:
+        """One indentation: `first` or, with a model of the specimen, `check`; kept whatever ends it."""
         source = self._source
         bus, names = source.bus, source.names
         estimator = IndentationEstimator(
@@ -139,30 +163,40 @@ class Characterisation:
             found.append(sample)
             topics[type(sample)].publish(sample)
 
-        seen = bus.topic(names.camera, Frame) if names.camera is not None else deformations
+        frames = bus.topic(names.camera, Frame) if names.camera is not None else deformations
         hosts: list[EstimatorHost] = []
+        seen: list[DeformationSample] = []
+        watch = deformations.subscribe(seen.append)
 
         def begin() -> None:
             hosts.append(
                 EstimatorHost(
                     source.clock,
                     estimator,
-                    (bus.topic(names.sensor, ForceSample), seen),
+                    (bus.topic(names.sensor, ForceSample), frames),
                     publish,
                     keep_samples=self._keep_samples,
                 )
             )
             self._on_host(host_name(1 if model is None else 2), hosts[-1].inbox)
 
+        rests = None
         try:
-            source.indent(begin, progress)
+            rests = source.indent(begin, progress)
         finally:
             for host in hosts:
                 host.close()
+            for sample in estimator.finish():
+                publish(sample)
+            watch.cancel()
+            matched = [s for s in found if isinstance(s, IndentationSample)]
+            drift = drift_of(seen, matched, rests)
             indentation = Indentation(
-                samples=[s for s in found if isinstance(s, IndentationSample)],
+                samples=matched,
                 unmatched=estimator.matcher.unmatched,
-                deformations=[s for s in found if isinstance(s, DeformationSample)],
+                frames=without_drift(all_frames(matched, seen, estimator.matcher.given_up), drift),
+                drift=drift,
+                deformations=seen,
                 estimates=[s for s in found if isinstance(s, SpecimenEstimate)],
                 forces=[s for s in found if isinstance(s, VisionForceSample)],
                 arrivals=[order for host in hosts for order in host.inbox.arrivals],
@@ -172,19 +206,6 @@ class Characterisation:
                 self.first = indentation
             else:
                 self.check = indentation
-        return indentation
-
-
-def record_of(samples: Sequence[IndentationSample]) -> IndentationRecord:
-    """Matched samples as arrays; their noise is the median of what they state, NaN where they state none."""
-    start_ns = samples[0].t_ns if samples else 0
-    return IndentationRecord(
-        time_s=np.array([(sample.t_ns - start_ns) / NS_PER_S for sample in samples]),
-        deformation_um=np.array([sample.deformation_um for sample in samples]),
-        force_uN=np.array([sample.force_uN for sample in samples]),
-        deformation_sigma_um=_median([sample.deformation_sigma_um for sample in samples]),
-        force_sigma_uN=_median([sample.force_sigma_uN for sample in samples]),
-    )
 
 
 def after_slip(identification: Identification) -> SpecimenModel:
@@ -193,8 +214,3 @@ def after_slip(identification: Identification) -> SpecimenModel:
     pressed_s = identification.contact_duration_s
     gone_um = float(slipped_um(model, pressed_s))
     return model._replace(slip_um=model.slip_um - gone_um, contact_um=model.contact_um + gone_um)
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if value > 0.0]
-    return float(np.median(known)) if known else float("nan")

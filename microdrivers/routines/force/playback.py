@@ -7,7 +7,7 @@ from collections.abc import Callable
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.recording.indentation_table import IndentationTable
-from microdrivers.routines.force.source import FrameTracker, IndentationNames, IndentationSetup
+from microdrivers.routines.force.source import FrameTracker, IndentationNames, IndentationSetup, Rests
 from microdrivers.routines.progress import Progress
 
 
@@ -26,10 +26,11 @@ class IndentationPlayback:
         progress.step(f"{len(self._table)} samples from {self._table.file}")
         return None
 
-    def indent(self, begin: Callable[[], None], progress: Progress) -> None:  # noqa: ARG002 - it takes no time
-        """Publish the recording."""
+    def indent(self, begin: Callable[[], None], progress: Progress) -> Rests | None:  # noqa: ARG002 - it takes no time
+        """Publish the recording; nothing is known of rests."""
         begin()
         self._table.publish(self.bus, sensor=self.names.sensor, deformation=self.names.deformation)
+        return None
 
     def finish(self) -> None:
         """Nothing moves."""

@@ -10,21 +10,28 @@ from typing import NamedTuple
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced, OutOfRange
 from microdrivers.core.samples import ForceSample, Frame
-from microdrivers.core.units import Range, check_range
+from microdrivers.core.units import check_range
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
+from microdrivers.routines.force.press_settings import DEPTHS_UM, SPEEDS_UM_S, PressSettings
 from microdrivers.routines.force.sight import Sight
-from microdrivers.routines.force.source import BEGIN, END, READY, FrameTracker, IndentationNames, IndentationSetup
+from microdrivers.routines.force.source import (
+    BEGIN,
+    END,
+    READY,
+    FrameTracker,
+    IndentationNames,
+    IndentationSetup,
+    Rests,
+)
 from microdrivers.routines.force.watches import Felt, Lost
 from microdrivers.routines.force.way import ProbingWay
 from microdrivers.routines.notes import note
 from microdrivers.routines.progress import Progress
 
-SPEEDS_UM_S = Range(0.1, 100.0)
-DEPTHS_UM = Range(5.0, 1000.0)
 _LOOK_S = 0.05
 _AFTER_S = 0.5
 _SHARE_OF_LIMIT = 0.8
@@ -35,31 +42,6 @@ _CONTACT_READINGS = 3
 _REST_FRAMES = 10
 _WATCH_S, _WATCH_FRAMES, _RECOVERED_UM, _LONGEST_RECOVERY_S = 0.5, 8, 0.1, 120.0
 """The specimen has recovered when its surface has moved by less than this over so many frames, so far apart."""
-
-
-class PressSettings(NamedTuple):
-    """The experiment's figures; the speed is the paper's.
-
-    Attributes:
-        depth_um: how far to press beyond the contact. max_force_uN: where pressing ends before that; None: 80 % of the
-            guard's limit or, without a guard, of the sensor's range.
-        hold_s: how long to stay at the deepest point.
-        free_travel_um: how far the probe travels in sight, touching nothing, to measure the scale; in `free_steps`.
-        most_approach_um: how far to look for the specimen beyond the starting point.
-        back_off_um: how far before the contact an indentation begins. rest_s: how long the specimen may recover.
-    """
-
-    speed_um_s: float = 5.0
-    depth_um: float = 110.0
-    max_force_uN: float | None = None
-    hold_s: float = 0.0
-    tare_s: float = 0.5
-    free_travel_um: float = 160.0
-    free_steps: int = 8
-    free_speed_um_s: float = 200.0
-    most_approach_um: float = 200.0
-    back_off_um: float = 15.0
-    rest_s: float = 5.0
 
 
 class PressExperiment:
@@ -88,7 +70,7 @@ class PressExperiment:
         self._limit_uN = self._force_limit_uN()
         self._way: ProbingWay | None = None
         self._contact_um = math.nan
-        self._touched = False
+        self._near = False
         self._indented = False
         self._watcher: FrameTracker | None = None
         self._check_settings()
@@ -129,16 +111,18 @@ class PressExperiment:
         travel = self._travel_in_sight(way, progress)
         self._sight.learn(*travel[:2], scale_hint_px_per_um=travel.scale_hint_px_per_um)
         progress.step("approach until contact")
+        self._near = True
         self._contact_um = self._approach(way)
-        self._touched = True
         progress.step(f"contact after {self._contact_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
         self._go(way, self._contact_um - self.settings.back_off_um, self.settings.free_speed_um_s)
         self.clock.sleep(self.settings.rest_s)
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
         ahead_um = self._contact_um - way.place_um(self._stage.read().position)
-        tracker = self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um)
-        # Another one: what is seen between indentations must not change what is seen in them.
-        self._watcher = self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um)
+        # Two: what is seen between indentations must not change what is seen in them.
+        tracker, self._watcher = (
+            self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um, depth_um=self.settings.depth_um)
+            for _ in range(2)
+        )
         self._sensor.tare(self.settings.tare_s)
         self._note_ready(travel, rest, ahead_um)
         return tracker
@@ -156,6 +140,7 @@ class PressExperiment:
             "scale_hint_px_per_um": travel.scale_hint_px_per_um,
             "rest_frames": [frame.seq for frame in rest],
             "contact_ahead_um": ahead_um,
+            "depth_um": self.settings.depth_um,
         }
         note(self.bus, self.clock, READY, known)
 
@@ -170,7 +155,7 @@ class PressExperiment:
                 "itself",
                 device=self._stage.name,
                 remedy=f"take the probe away from the specimen, then: microdrivers reference "
-                f"{self._rig.description.file} {self._stage.name}",
+                f"{self._rig.description.file} --device {self._stage.name}",
             )
 
     def _travel_in_sight(self, way: ProbingWay, progress: Progress) -> _Travel:
@@ -223,7 +208,7 @@ class PressExperiment:
 
     # ------------------------------------------------------------------ one indentation
 
-    def indent(self, begin: Callable[[], None], progress: Progress) -> None:
+    def indent(self, begin: Callable[[], None], progress: Progress) -> Rests:
         """Press to the depth or to the force limit, and come back at the same speed."""
         assert self._way is not None
         way, asked = self._way, self.settings
@@ -246,14 +231,19 @@ class PressExperiment:
             note(self.bus, self.clock, BEGIN, {})
             begin()
             self.clock.sleep(_AFTER_S)
+            until_ns, rested_um = self.clock.now_ns(), way.place_um(self._stage.read().position)
             self._run(way, end_um, lambda: felt.enough or lost.too_long, lambda um: show(um, back=False))
             lost.raise_if_too_long(self._camera.name)
             if asked.hold_s:
                 self.clock.sleep(asked.hold_s)
-            self._run(way, start_um, lambda: lost.too_long, lambda um: show(um, back=True))
+            back_um = self._run(way, start_um, lambda: lost.too_long, lambda um: show(um, back=True))
+            since_ns = self.clock.now_ns()
             lost.raise_if_too_long(self._camera.name)
             self.clock.sleep(_AFTER_S)
-            note(self.bus, self.clock, END, {})
+            # A place read at rest is off by up to half a step, either time.
+            rests = Rests(until_ns, since_ns, back_um - rested_um, way.step_um / math.sqrt(6.0))
+            note(self.bus, self.clock, END, rests._asdict())
+        return rests
 
     def _let_recover(self, progress: Progress) -> None:
         """Wait until the specimen's surface has come to rest, as the camera sees it."""
@@ -295,7 +285,7 @@ class PressExperiment:
         try:
             move.wait()
         except MoveCancelled:
-            if not told:
+            if not told or self._rig.safety.tripped:
                 raise
             self._rest()
         finally:
@@ -329,13 +319,13 @@ class PressExperiment:
     # ------------------------------------------------------------------ afterwards
 
     def finish(self) -> None:
-        """Stop, and take the probe away if it has touched something; a guard that does so already is let finish."""
+        """Stop, and take the probe away if it may touch something; a guard that does so already is let finish."""
         self._rig.safety.finish()
         self._stage.stop(by="characterisation", reason="the experiment ended")
-        if self._touched and self._stage.link == "open" and self._stage.retract_um is not None:
+        if self._near and self._stage.link == "open" and self._stage.retract_um is not None:
             self._rest()
             self._stage.retract().wait()
-            self._touched = False
+            self._near = False
 
     def setup(self) -> IndentationSetup:
         """Names, speed, scale and zoom."""

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
+from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.errors import UnsupportedError
-from microdrivers.core.samples import Frame
+from microdrivers.core.samples import ForceSample, Frame
 from microdrivers.estimators.vision.contact import ImageScale
 from microdrivers.recording.reader import Recording
-from microdrivers.recording.replay import Note, Replay, notes_of
+from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
 from microdrivers.routines.force.sight import Sight
 from microdrivers.routines.force.source import (
     BEGIN,
@@ -19,6 +20,7 @@ from microdrivers.routines.force.source import (
     FrameTracker,
     IndentationNames,
     IndentationSetup,
+    Rests,
     host_name,
 )
 from microdrivers.routines.progress import Progress
@@ -47,6 +49,7 @@ class IndentationReplay:
         self._ends = [note for note in notes if note.kind == END and note.order > self._ready.order]
         self.names = IndentationNames(**self._ready.content["names"])
         self.repeatable = len(self._begins) > 1
+        self._inputs = (self.names.sensor, self.names.camera or self.names.deformation)
         self._replay = Replay(recording, self.bus)
         self._indentations = 0
 
@@ -64,7 +67,7 @@ class IndentationReplay:
             if frame.seq in wanted:
                 frames[frame.seq] = frame
 
-        subscription = self.bus.topic(self.names.camera, Frame).subscribe(keep)
+        subscription = self.bus.topic(self.names.camera, Frame, history=FRAME_HISTORY).subscribe(keep)
         self._replay.up_to(self._ready.order)
         subscription.cancel()
         projection = known["projection"]
@@ -76,7 +79,9 @@ class IndentationReplay:
             scale_hint_px_per_um=known["scale_hint_px_per_um"],
         )
         rest = self._all(frames, known["rest_frames"])
-        return sight.tracker(self.names.camera, rest, contact_ahead_um=known["contact_ahead_um"])
+        return sight.tracker(
+            self.names.camera, rest, contact_ahead_um=known["contact_ahead_um"], depth_um=known["depth_um"]
+        )
 
     def _all(self, frames: dict[int, Frame], numbers: Sequence[int]) -> list[Frame]:
         missing = [number for number in numbers if number not in frames]
@@ -87,20 +92,25 @@ class IndentationReplay:
             )
         return [frames[number] for number in numbers]
 
-    def indent(self, begin: Callable[[], None], progress: Progress) -> None:
+    def indent(self, begin: Callable[[], None], progress: Progress) -> Rests | None:
         """Publish the next indentation of the recording."""
         number = self._indentations = self._indentations + 1
         start = self._begins[number - 1].order if number <= len(self._begins) else None
         self._replay.up_to(start)
         begin()
-        self._replay.as_arrived(host_name(number), self._end(number))
+        end = self._end(number)
+        self._replay.as_arrived(host_name(number), self._inputs, None if end is None else end.order)
         if self._replay.missing:
             progress.step(f"{self._replay.missing} samples that the estimators had are not in the recording")
+        self._replay.require(
+            self.bus.topic(self.names.sensor, ForceSample), self.bus.topic(self.names.deformation, DeformationSample)
+        )
+        return Rests(**end.content) if end is not None and end.content else None
 
-    def _end(self, number: int) -> int | None:
-        """Where the indentation ends in the bus's order: at its note or, if it was broken off, with the recording."""
+    def _end(self, number: int) -> Note | None:
+        """The note that ends the indentation; None if it was broken off, and ends with the recording."""
         later: list[Note] = [note for note in self._ends if note.order > self._begins[number - 1].order]
-        return later[0].order if later else None
+        return later[0] if later else None
 
     def finish(self) -> None:
         """Publish what is left."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from microdrivers.core.contact_samples import IndentationSample, VisionForceSample
 from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.units import NS_PER_S
-from microdrivers.estimators.force.identify import Identification
+from microdrivers.devices.force_sensor import SATURATED
 from microdrivers.estimators.force.motion_limit import largest_speed_um_s
 from microdrivers.estimators.force.protocol_fit import ProtocolFit
 from microdrivers.estimators.force.vision_force import OUTSIDE_RANGE
@@ -48,7 +48,7 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
         ),
         protocols={name: _protocol(fit, _relative_scale_sigma(run.setup)) for name, fit in found.protocols.items()},
         best=found.best,
-        slip=_slip(found),
+        slip=_slip(run),
         misfit=Misfit(
             found=best.misfit.found,
             statistic=_known(best.misfit.statistic),
@@ -122,13 +122,17 @@ def _relative_scale_sigma(setup: IndentationSetup) -> float:
     return sigma / scale if scale and sigma else 0.0
 
 
-def _slip(found: Identification) -> SlipFit | None:
+def _slip(run: ForceRun) -> SlipFit | None:
+    """The offset is as uncertain as the picture's scale and drift, too."""
+    found, drift = run.identification, run.first.drift
     slip = found.slip
     if slip is None:
         return None
+    drifted_um = 0.0 if drift is None else drift.sigma_um_s * found.contact_duration_s
+    scaled_um = _relative_scale_sigma(run.setup) * slip.offset_um
     return SlipFit(
         offset_um=slip.offset_um,
-        offset_sigma_um=_known(slip.sigma_offset_um),
+        offset_sigma_um=_known(math.hypot(slip.sigma_offset_um, drifted_um, scaled_um)),
         rate_per_s=slip.rate_per_s,
         rate_sigma_per_s=_known(slip.sigma_rate_per_s),
         not_returned_um=slip.not_returned_um,
@@ -146,13 +150,15 @@ def _speed_limit(best: ProtocolFit, force_uN: float) -> float | None:
 
 def _excluded(run: ForceRun) -> dict[str, int]:
     excluded = {reason: len(where) for reason, where in run.identification.excluded_samples.items() if len(where)}
+    excluded.pop("not measured", None)  # told by each frame's own reason
     for reason, count in run.first.unmatched.items():
-        excluded[f"frames_{reason.lower()}"] = count
+        if reason != SATURATED:
+            excluded[f"frames_{reason.lower()}"] = count
     return excluded
 
 
 def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
-    known = run.setup
+    known, drift = run.setup, run.first.drift
     return Setup(
         sensor=known.sensor,
         stage=known.stage,
@@ -165,6 +171,8 @@ def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
         deepest_um=best.deepest_um,
         largest_force_uN=largest_uN,
         tare_uN=known.tare_uN,
+        image_drift_um_s=None if drift is None else drift.rate_um_s,
+        image_drift_sigma_um_s=None if drift is None else drift.sigma_um_s,
     )
 
 
@@ -174,8 +182,8 @@ def _traces(run: ForceRun) -> ForceTraces:
     start_ns = pairs[0][0].t_ns if pairs else 0
     return ForceTraces(
         time_s=record.time_s.tolist(),
-        deformation_um=record.deformation_um.tolist(),
-        force_uN=record.force_uN.tolist(),
+        deformation_um=_trace(record.deformation_um),
+        force_uN=_trace(record.force_uN),
         branch=found.branches.labels(),
         fitted_uN={name: _trace(fit.force_uN) for name, fit in found.protocols.items()},
         check_time_s=[(sample.t_ns - start_ns) / NS_PER_S for sample, _ in pairs],
@@ -195,7 +203,7 @@ def _known(value: float) -> float | None:
 def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
     notes = [f"{note[0].upper()}{note[1:]}." for note in run.identification.notes]
     if not run.complete:
-        notes.append("The run was interrupted; the result holds what had been measured until then.")
+        notes.append(f"The run ended early: {run.ended_by}. The result holds what had been measured until then.")
     lost = run.first.unmatched.get("LOST", 0)
     if lost:
         notes.append(f"The contact point was not seen in {lost} frames.")

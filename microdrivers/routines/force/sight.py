@@ -94,19 +94,22 @@ class Sight:
             _require_agreement(tip, self._projection)
         self._tip = tip
 
-    def tracker(self, camera: str, frames: Sequence[Frame], *, contact_ahead_um: float) -> DeformationTracker:
+    def tracker(
+        self, camera: str, frames: Sequence[Frame], *, contact_ahead_um: float, depth_um: float
+    ) -> DeformationTracker:
         """A tracker of the contact point and the tip.
 
         Args:
             camera: name under which it publishes.
             frames: the undeformed specimen, the tip at rest before it.
             contact_ahead_um: how far ahead of the tip the contact was felt.
+            depth_um: how far it will be pressed in; so long it must stay in view.
 
         Raises:
-            NoContactPatch: nothing ahead of the tip can be tracked.
+            NoContactPatch: nothing ahead of the tip can be tracked that stays in view.
         """
         assert self._tip is not None
-        patch = contact_patch(frames, self._tip, gap_um=contact_ahead_um)
+        patch = contact_patch(frames, self._tip, gap_um=contact_ahead_um, depth_um=depth_um)
         tracker = DeformationTracker(camera, tip=self._tip, patch=patch, scale=self._scale(self._tip))
         rest = [tracker.update(frame) for frame in frames]
         tracker.set_contact(

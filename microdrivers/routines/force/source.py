@@ -28,6 +28,21 @@ class IndentationNames(NamedTuple):
     camera: str | None
 
 
+class Rests(NamedTuple):
+    """The tool at rest out of contact, before and after an indentation.
+
+    Attributes:
+        until_ns, since_ns: when the first rest ended, and the second began.
+        travel_um: how much farther along the direction of probing its encoders say that it was in the second.
+        travel_sigma_um: standard deviation of it.
+    """
+
+    until_ns: int
+    since_ns: int
+    travel_um: float
+    travel_sigma_um: float
+
+
 class FrameTracker(Protocol):
     """Finds the deformation in a frame."""
 
@@ -70,8 +85,12 @@ class IndentationSource(Protocol):
     def prepare(self, progress: Progress) -> FrameTracker | None:
         """Make everything ready for an indentation; returns what finds the deformation in frames."""
 
-    def indent(self, begin: Callable[[], None], progress: Progress) -> None:
-        """Press once, to the limit and back. Calls `begin` when what follows belongs to the indentation."""
+    def indent(self, begin: Callable[[], None], progress: Progress) -> Rests | None:
+        """Press once, to the limit and back. Calls `begin` when what follows belongs to the indentation.
+
+        Returns:
+            Where the tool rested before and after, if that is known.
+        """
 
     def finish(self) -> None:
         """On any way out, an interruption included: the tool is away from the specimen and nothing moves any more."""

@@ -39,6 +39,12 @@ class ProbingWay:
         }
         self._path_per_um = float(np.hypot.reduce(list(self._shares.values())))
 
+    @property
+    def step_um(self) -> float:
+        """The smallest step along the way that the stage's encoders tell."""
+        steps = [abs(share) * self._stage.resolution[axis] for axis, share in self._shares.items()]
+        return float(np.hypot.reduce(steps)) / self._path_per_um**2
+
     def targets(self, place_um: float) -> dict[str, float]:
         """Targets of the stage's axes (`x_um=…`) for a place on the way."""
         return {f"{axis}_um": self._start_um[axis] + share * place_um for axis, share in self._shares.items()}

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.errors import UnsupportedError
-from microdrivers.core.samples import Frame
+from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.recording.reader import Recording
-from microdrivers.recording.replay import Note, Replay, notes_of
+from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
 from microdrivers.routines.optics.source import BEGIN, HOST, Optics, SourceNames
 from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.progress import Progress
@@ -37,7 +37,7 @@ class OpticsReplay:
         progress.step(f"replaying {self._recording.file}")
         tracker = make_tracker(noted["target"], near_px=tuple(noted["near_px"]))
         replay = Replay(self._recording, self.bus)
-        subscription = self.bus.topic(self.names.camera, Frame).subscribe(self._keep)
+        subscription = self.bus.topic(self.names.camera, Frame, history=FRAME_HISTORY).subscribe(self._keep)
         replay.up_to(self._beginning.order)
         subscription.cancel()
         first = [frame for frame in self._frames if frame.seq == noted["first_frame"]]
@@ -49,9 +49,10 @@ class OpticsReplay:
         tracker.update(first[-1])
         self._frames.clear()
         begin(tracker)
-        replay.as_arrived(HOST, None)
+        replay.as_arrived(HOST, (self.names.stage, self.names.zoom, self.names.camera), None)
         if replay.missing:
             progress.step(f"{replay.missing} samples that the estimator had are not in the recording")
+        replay.require(self.bus.topic(self.names.stage, XYThetaSample), self.bus.topic(self.names.zoom, ZoomSample))
 
     def _keep(self, frame: Frame) -> None:
         if frame.seq == self._beginning.content["first_frame"]:

@@ -199,6 +199,20 @@ def test_stretches_that_were_not_measured_are_left_out_and_told():
     assert set(found.excluded_samples["saturated"]) == set(np.flatnonzero(record.force_uN >= 600.0))
     assert is_near(found.protocols["single"], PRESETS["single"])
     assert not found.misfit.found
+    assert any("end of its range" in note for note in found.notes)
+
+
+def test_contact_that_is_lost_while_pressing_ends_the_loading():
+    record = recorded("single")
+    turn = identified("single").branches.loading.stop
+    gone = turn - 100
+    noise = np.random.default_rng(3).normal(0.0, 0.05, len(record.time_s))
+    found = identify(record._replace(force_uN=np.where(np.arange(len(noise)) < gone, record.force_uN, noise)))
+    assert found.best == "loading"
+    assert found.branches.loading.stop == pytest.approx(gone, abs=2)
+    assert found.branches.lost.stop == len(noise)
+    assert is_near(found.protocols["loading"], PRESETS["single"])
+    assert any("contact was lost" in note and "still grew" in note for note in found.notes)
 
 
 def test_every_sample_is_either_used_or_excluded_for_one_reason():

@@ -177,6 +177,50 @@ def test_sigma_follows_the_scatter_of_the_readings_and_their_number() -> None:
     assert all(0.3 / math.sqrt(2.0) < s.force_sigma_uN < 3.0 for s in slow)
 
 
+def test_sigma_of_a_sensor_that_is_read_faster_than_it_answers() -> None:
+    """A low-pass of 125 Hz noise bandwidth, read at 1 kHz: neighbouring readings are alike."""
+    rng = np.random.default_rng(6)
+    noise = [0.0]
+    for fresh in rng.normal(0.0, 0.4, 20_000).tolist():
+        noise.append(math.exp(-0.5) * noise[-1] + math.sqrt(1.0 - math.exp(-1.0)) * fresh)
+    forces = [reading(float(t), 0.02 * t + value) for t, value in enumerate(noise)]
+    matched = fed(IndentationMatcher(), _with_frames(forces, exposure_ms=16.0))
+    stated = np.nanmedian([sample.force_sigma_uN for sample in matched])
+    off = np.array([sample.force_uN - 0.02 * sample.t_ns / MS for sample in matched])
+    assert len(matched) > 400
+    assert stated == pytest.approx(np.std(off), rel=0.1)
+    assert stated > 1.5 * 0.4 / math.sqrt(16.0)
+
+
+def _with_frames(forces: list[ForceSample], *, exposure_ms: float) -> Iterable[Sample]:
+    """Readings, and a frame every 33 of them."""
+    for index, sample in enumerate(forces):
+        yield sample
+        if index % 33 == 20:
+            yield frame(sample.t_ns / MS - 8.0, exposure_ms=exposure_ms)
+
+
+def test_at_the_end_nobody_is_late() -> None:
+    matcher = IndentationMatcher()
+    assert fed(matcher, [reading(40.0, 1.0), reading(55.0, 3.0), frame(50.0), frame(70.0, seq=1)]) == []
+    (matched,) = matcher.finish()
+    assert matched.t_ns == 50 * MS
+    assert matcher.unmatched == {"UNBRACKETED": 1}
+    assert (matcher.waiting, matcher.finish()) == (0, [])
+
+
+def test_frames_that_were_given_up_are_told() -> None:
+    matcher = IndentationMatcher()
+    full = ForceSample(
+        t_ns=50 * MS, device="probe", force_uN=math.nan, raw_uN=2001.0, tare_uN=1.0, flags=frozenset({"SATURATED"})
+    )
+    assert fed(matcher, [reading(40.0, 1.0), frame(20.0, found=False), frame(50.0), full, reading(70.0, 1.0)]) == []
+    lost, saturated = matcher.given_up
+    assert (lost.t_ns, lost.reason) == (20 * MS, "LOST")
+    assert math.isnan(lost.force_uN)
+    assert saturated == (50 * MS, "SATURATED", 2000.0)
+
+
 def test_scatter_of_few_or_quantised_readings() -> None:
     scatter = RunningScatter()
     for t in range(9):
@@ -196,3 +240,9 @@ def test_interpolated_frame_needs_valid_neighbours_but_not_more() -> None:
     assert len(fed(matcher, [frame(50.0), *forces])) == 1
     assert fed(matcher, [frame(80.0), reading(120.0, 1.0)]) == []
     assert matcher.unmatched == {"STALE": 1}
+
+
+def test_two_readings_of_the_same_instant() -> None:
+    twice = [sample for t in range(40) for sample in (reading(t, t), reading(t, t))]
+    (matched,) = fed(IndentationMatcher(), [frame(20.0, exposure_ms=0.0), *twice])
+    assert (matched.force_uN, matched.readings) == (20.0, 2)

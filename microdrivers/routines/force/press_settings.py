@@ -1,0 +1,35 @@
+"""The figures of an indentation by a live probe."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from microdrivers.core.units import Range
+
+SPEEDS_UM_S = Range(0.1, 100.0)
+DEPTHS_UM = Range(5.0, 1000.0)
+
+
+class PressSettings(NamedTuple):
+    """The experiment's figures; the speed is the paper's.
+
+    Attributes:
+        depth_um: how far to press beyond the contact. max_force_uN: where pressing ends before that; None: 80 % of the
+            guard's limit or, without a guard, of the sensor's range.
+        hold_s: how long to stay at the deepest point.
+        free_travel_um: how far the probe travels in sight, touching nothing, to measure the scale; in `free_steps`.
+        most_approach_um: how far to look for the specimen beyond the starting point.
+        back_off_um: how far before the contact an indentation begins. rest_s: how long the specimen may recover.
+    """
+
+    speed_um_s: float = 5.0
+    depth_um: float = 110.0
+    max_force_uN: float | None = None
+    hold_s: float = 0.0
+    tare_s: float = 0.5
+    free_travel_um: float = 160.0
+    free_steps: int = 8
+    free_speed_um_s: float = 200.0
+    most_approach_um: float = 200.0
+    back_off_um: float = 15.0
+    rest_s: float = 5.0
