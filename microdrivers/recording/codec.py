@@ -37,18 +37,23 @@ class Codec(Generic[MessageT]):
         fixed = [field for field in fields if field.kind in FIXED_KINDS]
         self._texts = [field for field in fields if field.kind in ("string", "strings")]
         self._varying = [field for field in fields if field not in fixed and field not in self._texts]
-        self._make = _positional(message_type, [field.name for field in [*fixed, *self._varying, *self._texts]])
-        self._tags = tuple(_tag(field) for field in fixed)
+        tags = tuple(_tag(field) for field in fixed)
         self._layout = struct.Struct(
             "<" + "".join(("B" if field.number < 16 else "H") + _FORMATS[field.kind] for field in fixed)
         )
-        self._template: list[Any] = [part for tag in self._tags for part in (tag, 0)]
+        self._template: list[Any] = [part for tag in tags for part in (tag, 0)]
         self._rest = {_tag(field): (index, field.kind) for index, field in enumerate([*self._varying, *self._texts])}
         self._empty_rest = [_EMPTY[field.kind] for field in [*self._varying, *self._texts]]
         self._fixed_of = _getter([field.name for field in fixed])
         self._texts_of = _getter([field.name for field in self._texts])
         self._written_texts: dict[tuple[Any, ...], bytes] = {}
         self._read_texts: dict[bytes, tuple[Any, ...]] = {}
+        self.decode: Callable[[bytes], MessageT] = _decoder(
+            message_type, self._layout, tags, [field.name for field in fixed],
+            [field.name for field in [*self._varying, *self._texts]],
+            self._decode_rest if self._varying else self._remembered_rest,
+        )  # fmt: skip
+        """The message with these bytes; raises UnusualLayout if they are in another layout than `encode` writes."""
 
     def encode(self, message: MessageT) -> bytes:
         """The message's bytes.
@@ -69,30 +74,12 @@ class Codec(Generic[MessageT]):
         varying = (_encode(field, getattr(message, field.name)) for field in self._varying)
         return b"".join((fixed, *varying, written))
 
-    def decode(self, data: bytes) -> MessageT:
-        """The message with these bytes.
-
-        Raises:
-            UnusualLayout: they are in another layout than `encode` writes.
-        """
-        layout = self._layout
-        try:
-            parts = layout.unpack_from(data)
-        except struct.error as error:
-            raise UnusualLayout from error
-        if parts[::2] != self._tags:
-            raise UnusualLayout
-        rest = data[layout.size :]
-        if self._varying:
-            others = self._decode_rest(rest)
-        else:
-            known = self._read_texts.get(rest)
-            if known is None:
-                known = self._decode_rest(rest)
-                _remember(self._read_texts, rest, known)
-            others = known
-        made: MessageT = self._make(*parts[1::2], *others)
-        return made
+    def _remembered_rest(self, data: bytes) -> tuple[Any, ...]:
+        known = self._read_texts.get(data)
+        if known is None:
+            known = self._decode_rest(data)
+            _remember(self._read_texts, data, known)
+        return known
 
     def _decode_rest(self, data: bytes) -> tuple[Any, ...]:
         values: list[Any] = self._empty_rest.copy()
@@ -135,11 +122,11 @@ def decoder_for(message_type: type[MessageT], schema: bytes) -> Callable[[bytes]
 
     if schema != schema_data(message_type):
         return library()
-    codec: Codec[MessageT] = codec_of(message_type)
+    usual: Callable[[bytes], MessageT] = codec_of(message_type).decode
 
     def decode(data: bytes) -> MessageT:
         try:
-            return codec.decode(data)
+            return usual(data)
         except UnusualLayout:
             return library()(data)
 
@@ -235,12 +222,41 @@ def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
     return lambda message: (get(message),)
 
 
-def _positional(message_type: type[MessageT], names: list[str]) -> Callable[..., MessageT]:
-    """Makes a message from values in the order of `names`, as written out by hand: five times as fast as a dict."""
-    given = ", ".join(names)
-    keywords = ", ".join(f"{name}={name}" for name in names)
-    make: Callable[..., MessageT] = eval(f"lambda {given}: message_type({keywords})", {"message_type": message_type})
-    return make
+_DECODER = """
+def decode(data):
+    try:
+        [{tags_and_fixed}] = unpack(data)
+    except struct_error as error:
+        raise UnusualLayout from error
+    if [{tags}] != expected:
+        raise UnusualLayout
+    [{rest}] = decode_rest(data[{size}:])
+    return message_type({keywords})
+"""
+
+
+def _decoder(
+    message_type: type[MessageT],
+    layout: struct.Struct,
+    tags: tuple[int, ...],
+    fixed: list[str],
+    rest: list[str],
+    decode_rest: Callable[[bytes], tuple[Any, ...]],
+) -> Callable[[bytes], MessageT]:
+    """Reads messages as if it were written out by hand for their type: twice as fast as a loop over fields."""
+    found = [f"tag_{name}" for name in fixed]
+    source = _DECODER.format(
+        tags_and_fixed=", ".join(part for pair in zip(found, fixed, strict=True) for part in pair),
+        tags=", ".join(found), rest=", ".join(rest), size=layout.size,
+        keywords=", ".join(f"{name}={name}" for name in [*fixed, *rest]),
+    )  # fmt: skip
+    names: dict[str, Any] = {
+        "unpack": layout.unpack_from, "struct_error": struct.error, "UnusualLayout": UnusualLayout,
+        "expected": list(tags), "decode_rest": decode_rest, "message_type": message_type,
+    }  # fmt: skip
+    exec(source, names)
+    decode: Callable[[bytes], MessageT] = names["decode"]
+    return decode
 
 
 def _remember(cache: dict[Any, Any], key: Any, value: Any) -> None:

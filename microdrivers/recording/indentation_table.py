@@ -38,6 +38,10 @@ class IndentationTable:
         self.file = file
         self._rows = Table(file, columns=COLUMNS, numeric=COLUMNS, may_be_nan=COLUMNS[1:]).rows
 
+    def column(self, name: str) -> list[float]:
+        """Values of `time_s`, `indentation_um` or `force_uN`; NaN where nothing was measured."""
+        return [row.numbers[name] for row in self._rows]
+
     def __len__(self) -> int:
         return len(self._rows)
 

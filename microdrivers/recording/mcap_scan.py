@@ -27,6 +27,7 @@ from microdrivers.recording.mcap_writer import CHUNK, MAGIC, RECORD
 _INDEX = struct.Struct("<BQHI")
 _FOOTER_SIZE = 29
 _BLOCK_BYTES = 1 << 20
+_WINDOW_BYTES = 2048
 _LONGEST_CHUNK = 1 << 32
 _CHUNK_PATTERN = re.compile(rb"\x06(?=.{36}(?:\x00{4}|\x04\x00{3}zstd))", re.DOTALL)
 _LOOKAHEAD = CHUNK.size + 12
@@ -131,44 +132,55 @@ class McapScan:
         return os.pread(self._stream.fileno(), size, offset)
 
     def _scan(self) -> None:
-        offset = len(MAGIC)
+        offset = window_start = len(MAGIC)
+        window = b""
         while offset < self.size:
-            length = self._record_at(offset)
+            begin = offset - window_start
+            if begin + _LOOKAHEAD > len(window):
+                window, window_start, begin = self._read(offset, _WINDOW_BYTES), offset, 0
+            length = self._take_index(window, begin)
+            if length is not None:
+                offset += length
+                continue
+            head = window[begin : begin + _LOOKAHEAD]
+            length = self._plausible(head, offset)
+            if length is not None and not self._take_up(head, offset, length):
+                length = None
             if length is None:
                 following = self._next_chunk(offset + 1)
                 ends = following == self.size
                 what = "the file ends in the middle of a record" if ends else "something is damaged here"
                 self.losses.append(Loss(offset, following - offset, what))
                 offset = following
-            elif length == 0:
+            elif head[0] == Opcode.DATA_END:
                 return
             else:
                 offset += length
         if self.size:
             self.losses.append(Loss(self.size, 0, "the recording was not ended: its last 0.1 s may be missing"))
 
-    def _record_at(self, offset: int) -> int | None:
-        """Take up the record there; its whole length, 0 at the end of the data, None if it is damaged."""
-        length = self._plausible(offset)
-        if length is None:
-            return None
-        head = self._read(offset, _LOOKAHEAD)
+    def _take_up(self, head: bytes, offset: int, length: int) -> bool:
+        """Take up the record that begins with `head`; False if it is damaged, and perhaps its length too."""
         opcode = head[0]
         if opcode == Opcode.CHUNK:
             self.chunks.append(ChunkPlace(offset, length, {}, compressed=head[CHUNK.size - 4] > 0))
-        elif opcode == Opcode.MESSAGE_INDEX:
-            _, _, channel, entries_size = _INDEX.unpack_from(head)
-            if self.chunks:
-                self.chunks[-1].holds[channel] = entries_size // 16
-        elif opcode == Opcode.DATA_END:
-            return 0
-        elif not self._other_record(opcode, offset, length):
-            return None if self._plausible(offset + length) is None else length
-        return length
+        elif opcode != Opcode.DATA_END and not self._other_record(opcode, offset, length):
+            return self._plausible(self._read(offset + length, _LOOKAHEAD), offset + length) is not None
+        return True
 
-    def _plausible(self, offset: int) -> int | None:
-        """The whole length of the record there if what it says of its size agrees."""
-        head = self._read(offset, _LOOKAHEAD)
+    def _take_index(self, window: bytes, begin: int) -> int | None:
+        """Take up the message index there, most of a file's records; its length, None if there is none."""
+        if len(window) < begin + _INDEX.size or window[begin] != Opcode.MESSAGE_INDEX or not self.chunks:
+            return None
+        length: int
+        _, length, channel, entries_size = _INDEX.unpack_from(window, begin)
+        if length != 6 + entries_size or entries_size % 16:
+            return None
+        self.chunks[-1].holds[channel] = entries_size // 16
+        return RECORD.size + length
+
+    def _plausible(self, head: bytes, offset: int) -> int | None:
+        """The whole length of the record that begins there, with `head`, if what it says of its size agrees."""
         if len(head) < RECORD.size:
             return None
         opcode, length = RECORD.unpack_from(head)
@@ -179,9 +191,6 @@ class McapScan:
                 (stored,) = struct.unpack_from("<Q", head, CHUNK.size + name_size)
                 agrees = length == CHUNK.size - 9 + name_size + 8 + stored
                 agrees = agrees and (stored == size if not name_size else size < _LONGEST_CHUNK)
-        elif opcode == Opcode.MESSAGE_INDEX and len(head) >= _INDEX.size:
-            *_, entries_size = _INDEX.unpack_from(head)
-            agrees = length == 6 + entries_size and entries_size % 16 == 0
         return RECORD.size + length if agrees and offset + RECORD.size + length <= self.size else None
 
     def _other_record(self, opcode: int, offset: int, length: int) -> bool:
@@ -205,7 +214,8 @@ class McapScan:
             block = self._read(offset, _BLOCK_BYTES + _LOOKAHEAD)
             for found in _CHUNK_PATTERN.finditer(block):
                 start = offset + found.start()
-                length = self._plausible(start) if found.start() < _BLOCK_BYTES else None
+                head = self._read(start, _LOOKAHEAD)
+                length = self._plausible(head, start) if found.start() < _BLOCK_BYTES else None
                 if length is not None and isinstance(
                     self.read_chunk(ChunkPlace(start, length, {}, compressed=False)), bytes
                 ):
@@ -224,7 +234,8 @@ class McapScan:
             return
         summary = self._read(footer.summary_start, self.size - _FOOTER_SIZE - len(MAGIC) - footer.summary_start)
         if zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary)) != footer.summary_crc:
-            self.losses.append(Loss(footer.summary_start, len(summary), "the file's summary is damaged"))
+            what = "the file's summary is damaged, or something follows it"
+            self.losses.append(Loss(footer.summary_start, len(summary), what))
             return
         for opcode, start, end in records_in(summary):
             record = _parsed(opcode, summary[start:end])

@@ -36,6 +36,8 @@ RECORD = struct.Struct("<BQ")
 """Opcode and length; then the record."""
 MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; then the message's data."""
+MESSAGE_BEGIN = struct.Struct("<BQHI")
+"""Opcode, length, channel, sequence: as much as a reader needs, and no record in a chunk is shorter."""
 CHUNK = struct.Struct("<BQQQQII")
 """Opcode, length, first and last log time, uncompressed size and CRC, length of the compression's name."""
 

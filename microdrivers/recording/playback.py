@@ -76,7 +76,7 @@ class RecordingPlayback:
 
     def _found(self, topic: Topic[Sample]) -> None:
         """Before any other subscriber: whoever is called for a sample finds the clock at its time."""
-        simulated = self.clock.simulated
+        simulated, name, counts = self.clock.simulated, topic.name, self.counts
 
         def take(sample: Sample) -> None:
             t_ns = sample.t_ns
@@ -87,7 +87,7 @@ class RecordingPlayback:
                 if simulated and t_ns - self._clock_ns >= _CLOCK_STEP_NS:
                     self._clock_ns = t_ns
                     self.clock.sleep_until(t_ns - self._first_ns)
-            self.counts[topic.name] += 1
+            counts[name] += 1
             self._done += 1
             if self._done % _REPORT_EVERY == 0:
                 self._on_progress(self._done)

@@ -6,14 +6,16 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
-from typing import TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import Sample
+from microdrivers.recording.channels import ARRIVALS_TOPIC
 from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording
 from microdrivers.recording.header import (
     CLOCK_RECORD,
@@ -25,13 +27,21 @@ from microdrivers.recording.header import (
     from_metadata,
 )
 from microdrivers.recording.mcap_scan import ChunkPlace, Loss, McapScan, read_definition
-from microdrivers.recording.mcap_writer import MESSAGE, RECORD
+from microdrivers.recording.mcap_writer import MESSAGE, MESSAGE_BEGIN, RECORD
 from microdrivers.recording.recorded_channels import Action, ChannelReader, FrameJoin, Unreadable, channel_reader
 from microdrivers.recording.survey import Survey, TopicSummary
 
 __all__ = ["Recording", "TopicSummary"]
 
 FoundT = TypeVar("FoundT")
+
+
+class _Wanted(NamedTuple, Generic[FoundT]):
+    """A channel whose messages are asked for, and what is made of them."""
+
+    topic: str
+    is_image: bool
+    act: Action[FoundT]
 
 
 class Recording:
@@ -68,7 +78,7 @@ class Recording:
 
         Each call reads the file anew. What cannot be read is left out, and is told by `losses`.
         """
-        return self._walk(topics, lambda reader: reader.take, leave_out=leave_out)
+        return chain.from_iterable(self._walk(topics, lambda reader: reader.take, leave_out=leave_out))
 
     @cached_property
     def _survey(self) -> Survey:
@@ -76,6 +86,13 @@ class Recording:
         for _ in self._walk(None, survey.counter):
             pass
         return survey
+
+    @cached_property
+    def _arrivals(self) -> Mapping[str, Sequence[int]]:
+        notes = Survey()
+        for _ in self._walk((ARRIVALS_TOPIC,), notes.counter):
+            pass
+        return notes.arrivals
 
     @property
     def topics(self) -> Mapping[str, TopicSummary]:
@@ -88,7 +105,7 @@ class Recording:
 
         Of a recording that was not ended, the last ones may be of samples that it does not hold.
         """
-        return self._survey.arrivals
+        return self._arrivals
 
     @property
     def attachments(self) -> Mapping[str, bytes]:
@@ -102,6 +119,20 @@ class Recording:
         what = Counter(self._unreadable.values())
         unreadable = [Loss(0, 0, f"{count} × {text}") for text, count in what.items()]
         return [*sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
+
+    @property
+    def flaws(self) -> list[str]:
+        """What whoever uses the recording should be told; the first look at it reads all of the file.
+
+        That is all that cannot be read, what the recorder itself has lost, and samples out of the order of time.
+        """
+        told = [f"not readable: {loss}" for loss in self.losses]
+        for name, topic in self.topics.items():
+            if topic.dropped:
+                told.append(f"not recorded: {topic.dropped} samples of {name!r}, which the recorder had to drop")
+            if topic.unsorted:
+                told.append(f"out of order: {topic.unsorted} samples of {name!r} are older than their predecessor")
+        return told
 
     def close(self) -> None:
         """Close the file; no samples can be read after it."""
@@ -121,16 +152,27 @@ class Recording:
         action: Callable[[ChannelReader], Action[FoundT]],
         *,
         leave_out: Collection[str] = (),
-    ) -> Iterator[tuple[str, FoundT]]:
-        """Topic, and what the channel's action makes of each message of the wanted topics, if it makes anything."""
-        actions: dict[int, tuple[ChannelReader, Action[FoundT]] | None] = {}
+    ) -> Iterator[list[tuple[str, FoundT]]]:
+        """By chunk: topic, and what the channel's action makes of each message of the wanted topics, if anything."""
+        actions: dict[int, _Wanted[FoundT] | None] = {}
         schemas: dict[int, Schema] = dict(self._scan.schemas)
         joins: dict[str, FrameJoin] = {}
+        defined: dict[int, tuple[Channel, Schema | None]] = {}
 
         def define(channel: Channel) -> None:
+            definition = channel, schemas.get(channel.schema_id)
+            if defined.get(channel.id) == definition:
+                return  # the summary's, again with its first message
+            defined[channel.id] = definition
             reader = channel_reader(channel, schemas.get(channel.schema_id), joins)
             wanted = _is_wanted(reader.topic, topics) and not (leave_out and _is_wanted(reader.topic, leave_out))
-            actions[channel.id] = (reader, action(reader)) if wanted else None
+            actions[channel.id] = _Wanted(reader.topic, reader.is_image, action(reader)) if wanted else None
+
+        def define_with(record: Schema | Channel | None) -> None:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                define(record)
 
         for channel in self._scan.channels.values():
             define(channel)
@@ -140,36 +182,43 @@ class Recording:
             chunk = self._scan.read_chunk(place)
             if isinstance(chunk, Loss):
                 self._damaged[place.offset] = chunk
+            else:
+                yield self._read_messages(place, chunk, actions, define_with)
+
+    def _read_messages(
+        self,
+        place: ChunkPlace,
+        chunk: bytes,
+        actions: Mapping[int, _Wanted[FoundT] | None],
+        define: Callable[[Schema | Channel | None], None],
+    ) -> list[tuple[str, FoundT]]:
+        """What is made of a chunk's messages; its definitions go to `define`."""
+        made: list[tuple[str, FoundT]] = []
+        head, body = MESSAGE_BEGIN.unpack_from, MESSAGE.size
+        position, last = 0, len(chunk) - MESSAGE_BEGIN.size
+        while position <= last:
+            start = position
+            opcode, length, number, sequence = head(chunk, start)
+            position = end = start + RECORD.size + length
+            if opcode != Opcode.MESSAGE:
+                define(read_definition(opcode, chunk[start + RECORD.size : end]))
                 continue
-            position = 0
-            while position < len(chunk):
-                start = position
-                opcode, length = RECORD.unpack_from(chunk, start)
-                position = end = start + RECORD.size + length
-                if opcode != Opcode.MESSAGE:
-                    record = read_definition(opcode, chunk[start + RECORD.size : end])
-                    if isinstance(record, Schema):
-                        schemas[record.id] = record
-                    elif isinstance(record, Channel):
-                        define(record)
-                    continue
-                _, _, number, sequence, _, _ = MESSAGE.unpack_from(chunk, start)
-                try:
-                    known = actions[number]
-                except KeyError:
-                    self._unreadable[place.offset, start] = "a message of a channel whose definition is lost"
-                    continue
-                if known is None:
-                    continue
-                reader, act = known
-                start += MESSAGE.size
-                try:
-                    found = act(memoryview(chunk)[start:end] if reader.is_image else chunk[start:end], sequence)
-                except Unreadable as error:
-                    self._unreadable[place.offset, start] = str(error)
-                    continue
-                if found is not None:
-                    yield reader.topic, found
+            try:
+                wanted = actions[number]
+            except KeyError:
+                self._unreadable[place.offset, start] = "a message of a channel whose definition is lost"
+                continue
+            if wanted is None:
+                continue
+            topic, is_image, act = wanted
+            try:
+                found = act(memoryview(chunk)[start + body : end] if is_image else chunk[start + body : end], sequence)
+            except Unreadable as error:
+                self._unreadable[place.offset, start] = str(error)
+                continue
+            if found is not None:
+                made.append((topic, found))
+        return made
 
 
 def open_scan(file: Path) -> McapScan:

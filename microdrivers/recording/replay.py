@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import json
+from collections import deque
 from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
 
-from microdrivers.core.bus import Bus, Topic
+from microdrivers.core.bus import HISTORY_LENGTH, Bus, Topic
 from microdrivers.core.clock import Clock
+from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import Frame, RoutineNote, Sample
 from microdrivers.recording.reader import Recording
 
@@ -19,7 +19,9 @@ ESTIMATES = ("estimate/*", "*/track", "*/deformation", ROUTINE)
 
 _READ_AHEAD = 2000
 """Samples by which the file's order may differ from the bus's: threads publish side by side."""
-_FRAMES_AHEAD = 64
+FRAME_HISTORY = 4
+"""So many past frames stay on the bus: to keep them costs fresh memory for each."""
+_FRAMES_AHEAD = 32
 """No more of them are frames: they are large."""
 
 
@@ -68,10 +70,9 @@ class Replay:
         self.missing = 0
         self._bus = bus
         self._source: Iterator[tuple[str, Sample]] = recording.samples(leave_out=leave_out)
-        self._waiting: list[tuple[int, int, str, Sample]] = []
+        self._waiting: deque[tuple[str, Sample]] = deque()
         self._frames_waiting = 0
         self._topics: dict[str, Topic[Any]] = {}
-        self._ties = itertools.count()
         self._recording = recording
         self._clock = clock
         self._speed = speed
@@ -79,51 +80,82 @@ class Replay:
 
     def up_to(self, order: int | None) -> None:
         """Publish all that was published on the bus before `order`; None: all that is left."""
-        while self._fill() and (order is None or self._waiting[0][0] < order):
-            self._publish_next()
+        waiting = self._waiting
+        while waiting or self._fill():
+            if order is not None and waiting[0][1].order >= order:
+                return
+            topic, sample = self._take_next()
+            self._publish(topic, sample)
 
-    def as_arrived(self, host: str, order: int | None) -> None:
-        """As `up_to`, with the samples of one inbox in the order in which it got them."""
+    def as_arrived(self, host: str, topics: Collection[str], order: int | None) -> None:
+        """Publish all that an inbox got, in the order in which it got it, and all else that was published meanwhile.
+
+        The inbox's own `topics` are held back until it listened and after it was closed. Where the order of arrival is
+        not known (at the end of a recording that was cut off, or anywhere in one without it), it is that of the bus,
+        and ends before `order`.
+        """
         arrivals = self._recording.arrivals
         if host not in arrivals:
             self.up_to(order)
             return
-        first = self._waiting[0][0] if self._fill() else 0
-        ordered = [each for each in arrivals[host] if each >= first and (order is None or each < order)]
+        waiting = self._waiting
+        first = waiting[0][1].order if waiting or self._fill() else 0
+        ordered = [each for each in arrivals[host] if each >= first]
         members = set(ordered)
         early: dict[int, tuple[str, Sample]] = {}
+        listening = False
         for wanted in ordered:
-            while wanted not in early and self._fill() and self._waiting[0][0] <= wanted:
-                number, topic, sample = self._take_next()
-                if number in members:
-                    early[number] = (topic, sample)
-                else:
+            while wanted not in early and (waiting or self._fill()) and waiting[0][1].order <= wanted:
+                topic, sample = self._take_next()
+                if sample.order in members:
+                    early[sample.order] = (topic, sample)
+                elif listening or topic not in topics:
                     self._publish(topic, sample)
             if wanted in early:
                 self._publish(*early.pop(wanted))
+                listening = True
             else:
                 self.missing += 1
-        self.up_to(order)
+        if not self._recording.complete:
+            self.up_to(order)
+
+    def require(self, *topics: Topic[Any]) -> None:
+        """Refuse a recording that has published nothing on one of the topics.
+
+        Raises:
+            UnsupportedError: it lacks what its estimators need.
+        """
+        for topic in topics:
+            if topic.latest is None:
+                raise UnsupportedError(
+                    f"{self._recording.file} has no samples of {topic.name!r}, which its analysis needs",
+                    remedy="record all topics that the routine listens to; by default all are recorded",
+                )
 
     def _fill(self) -> bool:
         """Read ahead; tells whether anything is left."""
-        while len(self._waiting) < _READ_AHEAD and self._frames_waiting < _FRAMES_AHEAD:
-            entry = next(self._source, None)
-            if entry is None:
-                break
-            topic, sample = entry
-            self._frames_waiting += isinstance(sample, Frame)
-            heapq.heappush(self._waiting, (sample.order, next(self._ties), topic, sample))
-        return bool(self._waiting)
+        waiting = self._waiting
+        if self._frames_waiting < _FRAMES_AHEAD:
+            newest = waiting[-1][1].order if waiting else -1
+            for entry in self._source:
+                order = entry[1].order
+                if order >= newest:
+                    waiting.append(entry)
+                    newest = order
+                else:
+                    _insert(waiting, entry)
+                self._frames_waiting += isinstance(entry[1], Frame)
+                if len(waiting) >= 2 * _READ_AHEAD or self._frames_waiting >= _FRAMES_AHEAD:
+                    break
+        return bool(waiting)
 
-    def _take_next(self) -> tuple[int, str, Sample]:
-        number, _, topic, sample = heapq.heappop(self._waiting)
-        self._frames_waiting -= isinstance(sample, Frame)
-        return number, topic, sample
-
-    def _publish_next(self) -> None:
-        _, topic, sample = self._take_next()
-        self._publish(topic, sample)
+    def _take_next(self) -> tuple[str, Sample]:
+        entry = self._waiting.popleft()
+        if isinstance(entry[1], Frame):
+            self._frames_waiting -= 1
+        if len(self._waiting) < _READ_AHEAD:
+            self._fill()
+        return entry
 
     def _publish(self, topic: str, sample: Sample) -> None:
         if self._speed is not None and self._clock is not None:
@@ -131,7 +163,8 @@ class Replay:
         self.published += 1
         found = self._topics.get(topic)
         if found is None or found.sample_type is not type(sample):
-            found = self._topics[topic] = self._bus.topic(topic, type(sample))
+            history = FRAME_HISTORY if isinstance(sample, Frame) else HISTORY_LENGTH
+            found = self._topics[topic] = self._bus.topic(topic, type(sample), history=history)
         found.publish(sample)
 
     def _keep_pace(self, sample: Sample, clock: Clock, speed: float) -> None:
@@ -139,3 +172,11 @@ class Replay:
             self._began_ns = clock.now_ns(), sample.t_ns
         start_ns, first_ns = self._began_ns
         clock.sleep_until(start_ns + round((sample.t_ns - first_ns) / speed))
+
+
+def _insert(waiting: deque[tuple[str, Sample]], entry: tuple[str, Sample]) -> None:
+    """Put it behind all that are not newer."""
+    place = len(waiting)
+    while place and waiting[place - 1][1].order > entry[1].order:
+        place -= 1
+    waiting.insert(place, entry)

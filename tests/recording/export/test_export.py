@@ -68,6 +68,19 @@ def test_hdf5(exported, recorded, tmp_path):
         assert images.dtype == np.uint8
         assert np.array_equal(images, [frame.image for frame in frames])
         assert file["camera/frame_id"][()].tolist() == [frame.frame_id for frame in frames]
+        assert (file["force/t_ns"].dtype, file["force/t_ns"].attrs["units"]) == (np.int64, "ns")
+        assert (file["force/time_s"].dtype, file["force/time_s"].attrs["units"]) == (np.float64, "s")
+        check_types_that_every_reader_takes(file)
+
+
+def check_types_that_every_reader_takes(file):
+    """Numbers, texts of a fixed length, no references: MATLAB's h5read and h5readatt give them as they are."""
+    things = [file]
+    file.visititems(lambda _name, thing: things.append(thing))
+    types = [thing.dtype for thing in things if isinstance(thing, h5py.Dataset)]
+    assert {dtype.kind for dtype in types} <= {"f", "i", "u", "S"}
+    attributes = [value for thing in things for value in thing.attrs.values()]
+    assert {type(value) for value in attributes} <= {str, np.int64}
 
 
 def test_hdf5_of_frames_that_change_and_tuples_of_any_length(stage, tmp_path):
