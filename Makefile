@@ -30,7 +30,7 @@ test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
 
 # What needs the machine to itself, in real time and one after the other: tools behind a serial CAN adapter and on
-# Modbus, independent Modbus masters, a calibration of a served rig. ON=guest runs it where nothing is late because the
+# Modbus, independent Modbus masters, routines on a served rig. ON=guest runs it where nothing is late because the
 # computer is busy: under User Mode Linux, in a time of its own.
 test-ports: $(READY) $(if $(filter guest,$(ON)),uml)
 	$(if $(filter guest,$(ON)),$(BIN)/python scripts/vcan-run -b uml -t 900 -s --) \
@@ -75,6 +75,8 @@ bench: $(READY)
 	$(BIN)/python scripts/bench_tracker.py
 	$(BIN)/python scripts/bench_worlds.py
 	$(BIN)/python scripts/bench_wires.py
+	$(BIN)/python scripts/bench_record.py
+	$(BIN)/python scripts/bench_replay.py
 	$(BIN)/python scripts/vcan-run --setup auto
 	$(BIN)/python scripts/bench_can.py
 

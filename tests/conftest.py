@@ -1,5 +1,6 @@
 """The same examples in every run: what a random search finds belongs into a test of its own. And strictness in CI."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -30,6 +31,12 @@ def pytest_runtest_makereport(item, call):
 def pytest_make_collect_report(collector):
     """A whole module can be skipped as it is imported."""
     return _refuse_skip((yield))
+
+
+def pytest_collection_finish(session):
+    """What was imported stays; to look through it again and again for garbage costs a tenth of the suite's time."""
+    gc.freeze()
+    gc.set_threshold(5_000)
 
 
 @pytest.fixture(scope="session")

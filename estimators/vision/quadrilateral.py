@@ -95,20 +95,24 @@ def side_lengths(quad: FloatArray) -> FloatArray:
 
 def is_square_like(quad: FloatArray, *, min_side_px: float) -> bool:
     """Whether sides and angles are those of a square seen under slight perspective."""
-    sides = side_lengths(quad)
-    if sides.min() < min_side_px or sides.min() < MIN_SIDE_RATIO * sides.max():
+    # Plain floats: ten times as fast as arrays of four.
+    corners = quad.tolist()
+    steps = [(u1 - u0, v1 - v0) for (u0, v0), (u1, v1) in zip(corners, corners[1:] + corners[:1], strict=True)]
+    sides = [math.hypot(du, dv) for du, dv in steps]
+    if min(sides) < min_side_px or min(sides) < MIN_SIDE_RATIO * max(sides):
         return False
-    along = (quad[FOLLOWING] - quad) / sides[:, None]
-    following = along[FOLLOWING]
-    cosines = np.abs(np.sum(along * following, axis=1))
-    turns = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
-    return bool(turns.min() > 0 and cosines.max() < np.sin(np.deg2rad(MAX_ANGLE_ERROR_DEG)))
+    along = [(du / side, dv / side) for (du, dv), side in zip(steps, sides, strict=True)]
+    largest_cosine = math.sin(math.radians(MAX_ANGLE_ERROR_DEG))
+    return all(
+        u0 * v1 - v0 * u1 > 0 and abs(u0 * u1 + v0 * v1) < largest_cosine
+        for (u0, v0), (u1, v1) in zip(along, along[1:] + along[:1], strict=True)
+    )
 
 
 def is_inside(quad: FloatArray, shape: tuple[int, int], *, margin_px: float) -> bool:
     """Whether all corners keep `margin_px` from the border of an image of `shape` (rows, columns)."""
-    upper = np.array([shape[1], shape[0]]) - 1.0 - margin_px
-    return bool(np.all(quad >= margin_px) and np.all(quad <= upper))
+    last_v, last_u = (size - 1.0 - margin_px for size in shape)
+    return all(margin_px <= u <= last_u and margin_px <= v <= last_v for u, v in quad.tolist())
 
 
 @cache
