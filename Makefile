@@ -26,8 +26,9 @@ demo: $(READY)
 	@rm -f $(OUT)/run.mcap
 	$(BIN)/microdrivers calibrate optics --seed $(SEED) --out $(OUT)
 
+# Bytecode is kept whatever the environment says: pytest rewrites every assertion, a twentieth of the time.
 test: $(READY)
-	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
 
 # What needs the machine to itself, in real time and one after the other: tools behind a serial CAN adapter and on
 # Modbus, independent Modbus masters, routines on a served rig. ON=guest runs it where nothing is late because the
@@ -74,6 +75,8 @@ bench: $(READY)
 	$(BIN)/python scripts/bench_bus.py
 	$(BIN)/python scripts/bench_tracker.py
 	$(BIN)/python scripts/bench_worlds.py
+	$(BIN)/python scripts/bench_force.py
+	$(BIN)/python scripts/bench_guard.py overshoot
 	$(BIN)/python scripts/bench_wires.py
 	$(BIN)/python scripts/bench_record.py
 	$(BIN)/python scripts/bench_replay.py

@@ -34,7 +34,7 @@ def pytest_make_collect_report(collector):
 
 
 def pytest_collection_finish(session):
-    """What was imported stays; to look through it again and again for garbage costs a tenth of the suite's time."""
+    """What was imported stays; to look through it again and again for garbage costs a twentieth of the time."""
     gc.freeze()
     gc.set_threshold(5_000)
 

@@ -19,7 +19,7 @@ from microdrivers.backends.lines.can_listeners import CanCounters
 from microdrivers.backends.lines.ports import DescriptorPort
 from microdrivers.core.units import NS_PER_S
 
-_END, _BELL = b"\r", b"\a"
+_END, _BELL, _TAKEN = b"\r", b"\a", b"z"
 _LONGEST_LINE = 32
 _CLOSE_WAIT_S = 0.05
 _OPENING_COMMANDS = 5
@@ -111,7 +111,7 @@ class BulkSlcan(can.BusABC):
 
     def _take_in(self, wait_ns: int) -> None:
         data = self._begun + self._port.read_within(wait_ns)
-        if _BELL in data:
+        if _BELL in data or (self._unanswered and _TAKEN in data):
             self._count_refusals(data)
         *lines, self._begun = data.replace(_BELL, _END).split(_END)
         if lines and not self._in_step:
@@ -124,6 +124,8 @@ class BulkSlcan(can.BusABC):
 
     def _count_refusals(self, data: bytes) -> None:
         """Adapters also refuse to close what is closed, and the empty command: python-can begins with both."""
+        if _TAKEN in data:  # it is open, and has taken a frame
+            self._unanswered = 0
         count = data.count(_BELL)
         self._counters.refused += max(0, count - self._unanswered)
         self._unanswered = max(0, self._unanswered - count)

@@ -44,6 +44,8 @@ class GivenUp(NamedTuple):
 class IndentationMatcher:
     """Deformations and forces in, indentations out, each with the mean force over the exposure of its frame.
 
+    It is that of a straight line through the readings within: few of them need not lie evenly about mid-exposure.
+
     A frame waits until readings lie on either side of its exposure. If none lies within it, because the sensor is
     slower than that, the force at mid-exposure is interpolated between the two around it; nothing is extrapolated.
     How the two streams interleave changes nothing in what comes out; within the sensor's stream, readings may come
@@ -181,8 +183,8 @@ class IndentationMatcher:
         self, frame: DeformationSample, within: list[ForceSample], before: ForceSample, after: ForceSample
     ) -> IndentationSample:
         if within:
-            force_uN = sum(reading.force_uN for reading in within) / len(within)
-            sigma_uN = self._scatter.sigma_of_mean(len(within))
+            force_uN, widened = _at_middle(within, frame.t_ns)
+            sigma_uN = widened * self._scatter.sigma_of_mean(len(within))
             used = within
         else:
             share = (frame.t_ns - before.t_ns) / (after.t_ns - before.t_ns)
@@ -224,6 +226,22 @@ def _instant(sample: Sample) -> int:
 
 def _end_ns(frame: DeformationSample) -> int:
     return frame.t_ns + round(frame.exposure_ms * NS_PER_MS / 2.0)
+
+
+def _at_middle(readings: list[ForceSample], middle_ns: int) -> tuple[float, float]:
+    """Mean force of an exposure by a straight line through its readings, which need not lie evenly about its middle.
+
+    The second is by how much that scatters more than the readings' mean does.
+    """
+    n = len(readings)
+    mean_uN = sum(reading.force_uN for reading in readings) / n
+    mean_ns = sum(reading.t_ns - middle_ns for reading in readings) / n
+    off_ns = [reading.t_ns - middle_ns - mean_ns for reading in readings]
+    spread = sum(t * t for t in off_ns)
+    if spread == 0.0:
+        return mean_uN, 1.0
+    slope = sum(t * reading.force_uN for t, reading in zip(off_ns, readings, strict=True)) / spread
+    return mean_uN - slope * mean_ns, math.sqrt(1.0 + n * mean_ns * mean_ns / spread)
 
 
 def _fault(readings: list[ForceSample]) -> str:

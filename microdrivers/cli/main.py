@@ -8,14 +8,24 @@ import os
 import signal
 import stat
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from microdrivers import __version__
 
+if TYPE_CHECKING:
+    from microdrivers.core.errors import MicrodriversError
+
 EXIT_ERROR = 1
 EXIT_INTERRUPTED = 130
+
+SERVED = "microdrivers.served"
+"""In a command's context: whether its devices are emulated by another program."""
+
+_SERVED_HINT = (
+    "these devices are emulated: see that `microdrivers serve` runs, and that this computer is not too busy for it"
+)
 
 
 class CommandLine(click.Group):
@@ -32,6 +42,8 @@ class CommandLine(click.Group):
                 raise
             click.secho("error: ", fg="red", bold=True, nl=False, err=True)
             click.echo(str(error), err=True)
+            if ctx.meta.get(SERVED) and _may_be_the_servers(error):
+                click.echo(f"  {_SERVED_HINT}", err=True)
             ctx.exit(EXIT_ERROR)
         except KeyboardInterrupt:
             click.echo("\ninterrupted; whatever was open has been told to stop and was closed", err=True)
@@ -62,6 +74,13 @@ def main(debug: bool) -> None:
     signal.signal(signal.SIGTERM, _interrupt)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup asks to go on
         signal.signal(signal.SIGHUP, _hang_up)
+
+
+def _may_be_the_servers(error: MicrodriversError) -> bool:
+    """Whether the program that emulates the devices may be the cause: it has ended, or is starved."""
+    from microdrivers.core.errors import LinkError
+
+    return isinstance(error, LinkError) or "heartbeat" in error.what or "no reading" in error.what
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from microdrivers.cli.main import SERVED
+
 if TYPE_CHECKING:
     from microdrivers.rig import Rig
 
@@ -47,10 +49,14 @@ class RigChoice(NamedTuple):
             raise ConfigError("--seed and --world describe a simulation", remedy="add --fake, or leave them out")
         live = not self.fake and self.wire_replay is None
         clock = SystemClock() if live or real_time else SimulatedClock()
-        return build_rig(
+        rig = build_rig(
             self.file, fake=self.fake, seed=self.seed or 0, clock=clock, world=self.world, wire_log=self.wire_log,
             wire_replay=self.wire_replay,
         )  # fmt: skip
+        context = click.get_current_context(silent=True)
+        if context is not None and live:
+            context.meta[SERVED] = rig.file.emulated
+        return rig
 
 
 def rig_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +18,9 @@ if TYPE_CHECKING:
     from microdrivers.rig.serving import ServedRig
 
 _LONGEST_S = 1e9
+_SWITCH_S = 0.0005
+"""How long a thread may compute while others wait for their turn: Python's 5 ms, times all that draw pictures, are
+longer than a bus may stand still."""
 _ADAPTER = "slcan"
 
 
@@ -81,15 +87,18 @@ def serve(
     description = load_rig_file(rig)
     if served is not None:
         check_writable(served, description)
-    with ServedRig(
-        description,
-        seed=seed,
-        world=world,
-        transport=transport,
-        bind=bind,
-        can_interface=None if can_interface == _ADAPTER else can_interface,
-        wire_log=wire_log,
-    ) as running:
+    with (
+        _quick_turns(),
+        ServedRig(
+            description,
+            seed=seed,
+            world=world,
+            transport=transport,
+            bind=bind,
+            can_interface=None if can_interface == _ADAPTER else can_interface,
+            wire_log=wire_log,
+        ) as running,
+    ):
         try:
             if served is not None:
                 running.write(served)
@@ -100,6 +109,16 @@ def serve(
                 running.clock.sleep(3600.0)
         except KeyboardInterrupt:
             click.echo("stopped", err=True)
+
+
+@contextmanager
+def _quick_turns() -> Iterator[None]:
+    usual_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(usual_s)
 
 
 def _announce(running: ServedRig, served: Path | None, duration_s: float | None, as_json: bool) -> None:

@@ -17,7 +17,7 @@ steps = st.lists(
 
 
 @pytest.mark.parametrize("framing", ["rtu", "tcp"])
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 @given(delays_s=delays_s, steps=steps, seed=st.integers(0, 100))
 def test_no_late_reply_is_taken_for_a_later_requests(
     framing: str, delays_s: list[float], steps: list[tuple[str, int, float]], seed: int

@@ -134,7 +134,7 @@ garbage = st.one_of(
 ).map(lambda data: data + b"\n")
 
 
-@settings(deadline=None, derandomize=True, max_examples=400)
+@settings(deadline=None, derandomize=True, max_examples=200)
 @given(garbage, st.integers(1, 3))
 def test_garbage_raises_protocol_errors_only(data: bytes, count: int) -> None:
     try:

@@ -1,6 +1,7 @@
 """What `serve` refuses before anything is served, and what it writes."""
 
 import socket
+import sys
 
 import pytest
 import yaml
@@ -113,3 +114,32 @@ def test_what_is_served_has_patience_with_a_busy_computer_and_says_so(tmp_path):
     assert force.connection.timeout_s == 1.0
     comment = [line for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
     assert "heartbeat_ms, timeout_s and stale_after_ms allow for a computer" in comment[1]
+
+
+@pytest.mark.xdist_group("real_time")
+@pytest.mark.parametrize("emulated", [True, False])
+def test_whoever_loses_an_emulated_device_is_told_to_look_at_the_server(run, own, tmp_path, emulated):
+    file = tmp_path / "served.yaml"
+    with ServedRig(load_rig_file(own)) as serving:
+        serving.write(file)
+    text = file.read_text(encoding="utf-8").replace("emulated: true", f"emulated: {str(emulated).lower()}")
+    file.write_text(text, encoding="utf-8")
+    result = run("move", file, "zoom", "--zoom", 1.0)
+    assert result.exit_code == 1
+    assert ("see that `microdrivers serve` runs, and that this computer is not too busy" in result.stderr) is emulated
+
+
+@pytest.mark.xdist_group("real_time")
+def test_threads_that_draw_pictures_keep_no_bus_waiting(run, own, monkeypatch):
+    usual_s, while_served_s = sys.getswitchinterval(), []
+    build = ServedRig.__init__
+
+    def note(self, *arguments, **options):
+        while_served_s.append(sys.getswitchinterval())
+        build(self, *arguments, **options)
+
+    monkeypatch.setattr(ServedRig, "__init__", note)
+    result = run("serve", own, "--for", 0)
+    assert result.exit_code == 0, result.output
+    assert while_served_s == [pytest.approx(0.0005)]
+    assert sys.getswitchinterval() == usual_s

@@ -14,9 +14,7 @@ import pytest
 from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.errors import RefusedError, UnsupportedError
 from microdrivers.devices.drivers import Endpoint, ServeRequest
-from microdrivers.fakes.can import Frame, Medium, PortError, SlcanAdapter, forget_medium, serve_medium, shared_medium
-from microdrivers.fakes.can.arrival import Arrival
-from microdrivers.fakes.can.frame import Due
+from microdrivers.fakes.can import Frame, Medium, PortError, forget_medium, serve_medium, shared_medium
 from microdrivers.fakes.can.interface_bridge import InterfaceBridge
 from microdrivers.fakes.can.serving import HeldUpPort
 from tests.fakes.can_bench import SDO_REPLY, SDO_REQUEST, Answering, Listener, Periodic
@@ -337,73 +335,3 @@ def test_an_interface_carries_one_bus(
         "connection": {"interface": "socketcan", "channel": "vcan0", "bitrate": 500_000, "options": {}}
     }
     endpoint.close()
-
-
-def test_a_frame_that_comes_while_the_adapter_looks_does_not_keep_it_asleep(clock: SystemClock, medium: Medium) -> None:
-    """Between the look that finds it and the next one nothing is left to be woken by: the frame after it must wake."""
-    adapter = SlcanAdapter(medium, byte_ns=3_000)
-    woken = threading.Event()
-    adapter.wake = woken.set
-    now = clock.now_ns
-    adapter.receive(b"S6\rO\r", now(), now())
-    other, port = medium.open_port(), adapter._port
-    assert port is not None
-    poll = port.poll
-
-    def send_and_poll(t_ns: int) -> Arrival | None:
-        port.poll = poll  # type: ignore[method-assign]
-        other.send(Frame(0x181))
-        assert woken.wait(PATIENCE_S)
-        woken.clear()
-        return poll(now())
-
-    port.poll = send_and_poll  # type: ignore[method-assign]
-    assert len(adapter.advance(now())) == 1
-    assert adapter.next_event_ns() is None  # whoever looks after the adapter goes to sleep now
-    other.send(Frame(0x182))
-    assert woken.wait(PATIENCE_S)
-
-
-class Owed:
-    """A node that wants something of a host 30 ms after it was attached, or later if hosts are excused."""
-
-    def __init__(self) -> None:
-        self.due_ns: int | None = None
-        self.missed = False
-        self.excuses: list[int] = []
-
-    def receive(self, _frame: Frame, _t_ns: int) -> list[Due]:
-        self.due_ns = None
-        return []
-
-    def advance(self, t_ns: int) -> list[Due]:
-        if self.due_ns is None:
-            self.due_ns = t_ns + 30_000_000
-        elif self.due_ns <= t_ns:
-            self.due_ns, self.missed = t_ns + 3_600_000_000_000, True
-        return []
-
-    def next_event_ns(self) -> int | None:
-        return self.due_ns
-
-    def excuse_hosts(self, late_ns: int, until_ns: int) -> None:
-        self.excuses.append(late_ns)
-        if self.due_ns is not None:
-            self.due_ns = max(self.due_ns + late_ns, until_ns)
-
-
-def test_no_host_is_blamed_for_time_in_which_the_computer_played_nothing(clock: SystemClock, medium: Medium) -> None:
-    node, host = Owed(), medium.open_port()
-    with medium.lock:  # nobody can let the bus go on
-        medium.attach(node)
-        clock.sleep(0.2)
-        host.send(Frame(0x77F))  # what was waiting to be read
-    wait_until(clock, lambda: node.due_ns is None or node.missed)
-    assert not node.missed
-    assert max(node.excuses) > 100_000_000
-
-
-def test_a_host_that_is_silent_is_blamed_all_the_same(clock: SystemClock, medium: Medium) -> None:
-    node = Owed()
-    medium.attach(node)
-    wait_until(clock, lambda: node.missed)

@@ -105,7 +105,7 @@ lines = st.text("abc", max_size=3).map(lambda text: f"{text}\n".encode())
 replies = st.lists(st.tuples(st.integers(0, 100), st.binary(min_size=1, max_size=4)), max_size=2)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=100)
 @given(log=st.lists(st.builds(LoggedRequest, lines, replies), max_size=12), data=st.data())
 def test_a_host_that_does_the_same_gets_the_same_however_it_cuts_its_bytes(log, data):
     emulator, sent = ReplayEmulator(log), b"".join(request.data for request in log)

@@ -47,6 +47,7 @@ def sound(calibrate):
     return calibrate(keep_samples=True)
 
 
+SHORT = {"change_after_frame": 22, "frames": 42}
 one_run = pytest.mark.xdist_group("the paper's calibration")
 
 
@@ -113,7 +114,7 @@ class ZoomThatNeverMoves(AzZoomMotor):
     ids=lambda value: getattr(value, "__name__", str(value)),
 )
 def test_a_planted_fault_spoils_the_calibration_by_name(calibrate, device, fault, name):
-    assert name in problems(calibrate(drivers={device: fault}, frames=60))
+    assert name in problems(calibrate(drivers={device: fault}, **SHORT))
 
 
 @pytest.mark.parametrize("fault", [SwappedReading, MirroredReading, StretchedReading], ids=lambda fault: fault.__name__)
@@ -242,7 +243,7 @@ def test_at_rest_the_calibration_needs_no_time_stamps(calibrate):
         def count(self, done, total):
             pass
 
-    calibration = calibrate(drivers={"camera_fine": NoStamps}, change_after_frame=22, frames=42, progress=Steps())
+    calibration = calibrate(drivers={"camera_fine": NoStamps}, **SHORT, progress=Steps())
     assert any("taking frames at rest" in text for text in steps)
     assert problems(calibration) == set()
     assert calibration.result.zoom_change.zoom_after == pytest.approx(1.2, rel=1e-3)
@@ -287,6 +288,6 @@ def test_a_frame_rate_that_poses_cannot_follow_is_taken_at_rest(calibrate):
     def faster(rig):
         rig.devices["camera_fine"].settings = msgspec.structs.replace(rig.devices["camera_fine"].settings, rate_hz=60.0)
 
-    calibration = calibrate(prepare=faster, change_after_frame=22, frames=42)
+    calibration = calibrate(prepare=faster, **SHORT)
     assert calibration.run.complete
     assert problems(calibration) == set()

@@ -72,12 +72,10 @@ def test_sensor_that_is_slower_than_the_exposure_is_interpolated_at_mid_exposure
 def test_a_ramp_is_met_at_mid_exposure(rate_hz: float) -> None:
     matched = fed(IndentationMatcher(), [*(frame(k * 33.3 + 7.0) for k in range(1, 30)), *readings(rate_hz, 1100.0)])
     assert len(matched) == 29
-    interpolated = [m for m in matched if m.readings == 0]
-    assert bool(interpolated) == (rate_hz == 30.0)
-    assert all(m.force_uN == pytest.approx(m.t_ns / MS, rel=1e-6) for m in interpolated)
-    # Few readings need not lie evenly about mid-exposure.
-    allowed_ms = min(500.0 / rate_hz, 5.0) + 1e-6
-    assert all(abs(m.force_uN - m.t_ns / MS) <= allowed_ms for m in matched)
+    assert any(m.readings == 0 for m in matched) == (rate_hz == 30.0)
+    # A single reading is the only one that must do as it is.
+    assert all(m.force_uN == pytest.approx(m.t_ns / MS, rel=1e-6) for m in matched if m.readings != 1)
+    assert all(abs(m.force_uN - m.t_ns / MS) <= 5.0 for m in matched)
 
 
 def test_nothing_is_extrapolated() -> None:
