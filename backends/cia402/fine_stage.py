@@ -67,7 +67,9 @@ class Cia402FineStage(FineStage):
         self.axes_in_rig = {axis: getattr(settings.axes_in_rig, axis) for axis in self.axis_names}
         self._settings = settings
         self._line = shared_can_line(settings.connection, clock=clock, bus=bus)
-        self._guard = Guard(tell=self._tell, faulted=self._note_fault, recover=self._recover_soon)
+        self._guard = Guard(
+            order=settings.reference_order, tell=self._tell, faulted=self._note_fault, recover=self._recover_soon
+        )
         timeout_s = settings.connection.timeout_s
         drives = [
             Drive(
@@ -180,6 +182,8 @@ class Cia402FineStage(FineStage):
     def _tell(self, kind: EventKind, reason: str) -> None:
         """Publish an event in its turn: the thread that receives may be ahead of it on a simulated clock."""
         if kind == "link_lost":
+            if self.link == "lost":  # one event, but whoever asks is told of all
+                self.clock.deliver(partial(setattr, self, "_lost_reason", reason))
             if self.link != "open":
                 return
             self.link = "lost"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from microdrivers.backends.canopen.emergency import Emergency, error_meaning
 from microdrivers.backends.canopen.heartbeat import NmtState
@@ -28,6 +28,7 @@ class Guard:
     `emergency`, `heartbeat` and `silence` are called in the thread that receives: they take no lock and await nothing.
 
     Args:
+        order: in which the axes are referenced.
         tell: publishes an event.
         faulted: is given each new fault, once.
         recover: has drives set up again, soon and elsewhere.
@@ -39,10 +40,11 @@ class Guard:
     drives: Drives
 
     def __init__(
-        self, *, tell: Callable[[EventKind, str], object], faulted: Callable[[DeviceFault], object],
-        recover: Callable[[], object],
+        self, *, order: Sequence[str], tell: Callable[[EventKind, str], object],
+        faulted: Callable[[DeviceFault], object], recover: Callable[[], object],
     ) -> None:  # fmt: skip
         self.on_duty = False
+        self._order = order
         self._tell = tell
         self._faulted = faulted
         self._recover = recover
@@ -75,7 +77,8 @@ class Guard:
         """A drive's heartbeat has stopped."""
         if self.on_duty:
             self._lose(drive, f"{drive.name} is silent: its heartbeat has stopped{self.drives.line.doubts}")
-            self._tell("link_lost", f"no heartbeat from {drive.name}{self.drives.line.doubts}")
+            gone = [other.name for other in self.drives.all if other is drive or not other.node.alive]
+            self._tell("link_lost", f"no heartbeat from {', '.join(gone)}{self.drives.line.doubts}")
 
     def lost(self, error: LinkLost) -> None:
         """The adapter is gone: nobody can be stopped, but drives miss our heartbeat. The stage has to be reopened."""
@@ -137,10 +140,14 @@ class Guard:
             self._to_raise = None
             raise next(iter(self._faults.values()))
         self.require_alive()
-        for drive in self.drives.all:
-            if not drive.ready:
-                remedy = f"make sure that the way is free, then reference([{drive.axis!r}])"
-                raise LinkLost(f"{drive.name} has restarted", remedy=remedy)
+        restarted = [drive.name for drive in self.drives.all if not drive.ready]
+        if restarted:
+            drives = (self.drives.by_axis[axis] for axis in self._order)
+            unknown = [drive.axis for drive in drives if not (drive.ready and drive.referenced)]
+            raise LinkLost(
+                f"{', '.join(restarted)} {'has' if len(restarted) == 1 else 'have'} restarted",
+                remedy=f"make sure that the way is free, then reference({unknown!r})",
+            )
 
     def require_alive(self) -> None:
         """Let pass only if no drive is known to be silent.

@@ -12,6 +12,9 @@ from microdrivers.core.units import Range
 from microdrivers.devices.drivers import DeviceSettings
 from microdrivers.devices.fine_stage_settings import ToolCarrierSettings
 
+_NEGATIVE_SWITCH, _POSITIVE_SWITCH = frozenset({1, 17}), frozenset({2, 18})
+"""Methods that end at a limit switch, or at the index beside it."""
+
 AxisName = Literal["x", "y", "z"]
 
 _AXES: tuple[AxisName, ...] = ("x", "y", "z")
@@ -70,6 +73,14 @@ class FineAxis(DeviceSettings):
             raise ValueError("homing_speeds_um_s must be positive: [to the switch, to zero]")
         return self
 
+    @property
+    def homing_end_um(self) -> float | None:
+        """The end of the travel at which a search for the reference ends; None if the method does not say."""
+        if self.homing_method not in _NEGATIVE_SWITCH | _POSITIVE_SWITCH:
+            return None
+        upper = (self.homing_method in _POSITIVE_SWITCH) == (self.direction == 1)
+        return self.travel_um.max if upper else self.travel_um.min
+
 
 class FineAxes(DeviceSettings):
     """The three axes, each with a drive of its own."""
@@ -123,6 +134,12 @@ class FineStageSettings(ToolCarrierSettings):
     def travel_um(self) -> Mapping[str, Range]:
         """Travel of x, y and z."""
         return {axis: getattr(self.axes, axis).travel_um for axis in _AXES}
+
+    @property
+    def homing_ends_um(self) -> Mapping[str, float]:
+        """The ends of the travel at which axes stand after a search for references that ends at a limit switch."""
+        ends = {axis: getattr(self.axes, axis).homing_end_um for axis in _AXES}
+        return {axis: end for axis, end in ends.items() if end is not None}
 
     def claims(self) -> tuple[str, ...]:
         """The three nodes."""

@@ -179,7 +179,7 @@ class Cia404ForceSensor(ForceSensor):
             OutOfRange: faster than the amplifier or the bus can. LinkError, SdoAbort: it could not be started.
         """
         self._require_open()
-        check_range(rate_hz, _RATES_HZ, what="stream rate", unit="Hz", device=self.name)
+        check_range(rate_hz, _RATES_HZ, what="stream rate", unit="Hz", device=self.name, in_file="")
         with self._naming_errors():
             self._begin_stream(rate_hz)
         try:

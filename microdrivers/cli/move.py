@@ -65,7 +65,7 @@ def move(choice: RigChoice, device: str, relative: bool, retract: bool, **option
             else:
                 _reference_emulated(rig, stage_or_zoom, given)
                 if retract:
-                    _retract(stage_or_zoom)
+                    _retract(rig, stage_or_zoom)
                 else:
                     click.echo(f"{device}: {_move_stage(stage_or_zoom, given, relative)}")
         except NotReferenced as error:
@@ -132,8 +132,8 @@ def _move_stage(stage: Stage[Any], given: dict[str, float], relative: bool) -> s
     return f"{state_text(stage, pose)}; off target by {', '.join(misses)}"
 
 
-def _retract(stage: FineStage) -> None:
-    """Take the tool away, and say how far that was.
+def _retract(rig: Rig, stage: FineStage) -> None:
+    """Take the tool away, and say how far that was; it is away if it stands at the end of its travel that way.
 
     Raises:
         NotReached: not the whole way that the rig file states.
@@ -147,7 +147,9 @@ def _retract(stage: FineStage) -> None:
     asked_um = math.hypot(*way.values())
     moved_um = sum((pose.position[axis] - start[axis]) * length for axis, length in way.items()) / asked_um
     click.echo(f"{stage.name}: {state_text(stage, pose)}; taken away by {moved_um:.2f} µm of {asked_um:g} µm")
-    if stage.retraction_share < 1.0 and asked_um - moved_um > max(stage.axes[axis].tolerance for axis in way):
+    if stage.retraction_at_end and rig.safety.trapped(stage) is None:
+        click.echo(f"{stage.name}: already at the end of its way away: nothing to retract")
+    elif stage.retraction_share < 1.0 and asked_um - moved_um > max(stage.axes[axis].tolerance for axis in way):
         raise NotReached(
             "the tool is not taken away as far as retract_um says: the travel ends, or a keep-out box begins",
             device=stage.name,

@@ -58,6 +58,9 @@ def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool
             found.reference(names)
         what = f"{', '.join(names)} referenced" if names else "reference found"
         click.echo(f"{found.name}: {what}; now at {state_text(found, found.read())}")
+        trapped = None if isinstance(found, ZoomMotor) else rig.safety.trapped(found)
+        if trapped is not None:
+            raise trapped
 
 
 def _find(rig: Rig, choice: RigChoice, name: str | None) -> Stage[Any] | ZoomMotor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from numbers import Real
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from microdrivers.core.errors import OutOfRange
 
@@ -37,8 +37,10 @@ class Range(NamedTuple):
         return f"{self.min:g} to {self.max:g}"
 
 
-def check_range(value: float, limits: Range, *, what: str, unit: str, device: str = "") -> float:
-    """Return `value` unchanged if it is finite and within `limits`.
+def check_range(
+    value: float, limits: Range, *, what: str, unit: str, device: str = "", in_file: Literal["both", "max", ""] = "both"
+) -> float:
+    """Return `value` unchanged if it is finite and within `limits`, of which the rig file may state both or one.
 
     Raises:
         OutOfRange: it is not; the message names the value, the limits and the unit. Nothing is ever clipped.
@@ -49,10 +51,11 @@ def check_range(value: float, limits: Range, *, what: str, unit: str, device: st
     if not math.isfinite(value):
         raise OutOfRange(f"{what} is {value}, not a finite number", device=device, remedy=f"give {what} in {unit}")
     if value not in limits:
+        correctable = in_file == "both" or (in_file == "max" and value > limits.max)
         raise OutOfRange(
             f"{what} = {value:g} {unit} is outside {limits} {unit}",
             device=device,
-            remedy="choose a value inside the limits, or correct the limits in the rig file",
+            remedy="choose a value inside the limits" + ", or correct the limits in the rig file" * correctable,
         )
     return value
 

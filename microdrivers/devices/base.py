@@ -193,7 +193,7 @@ class Device(ABC, Generic[SampleT]):
     def stream(self, rate_hz: float) -> Iterator[None]:
         """Publish samples at `rate_hz` on topic `<name>` while the context is open."""
         self._require_open()
-        check_range(rate_hz, STREAM_RATES_HZ, what="stream rate", unit="Hz", device=self.name)
+        check_range(rate_hz, STREAM_RATES_HZ, what="stream rate", unit="Hz", device=self.name, in_file="")
         self._stream_rate_hz = rate_hz
         timer = self.clock.every(1.0 / rate_hz, self._poll, name=f"{self.name} stream")
         try:

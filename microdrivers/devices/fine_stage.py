@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
@@ -13,6 +13,9 @@ from microdrivers.core.samples import FineStageSample
 from microdrivers.devices.motion import Move
 from microdrivers.devices.motion_plan import MotionKind, MotionPlan
 from microdrivers.devices.stage import Stage
+
+_END_TOLERANCES = 5.0
+"""A drive that has found a limit switch rests as far from it as it brakes, some tolerances of a move."""
 
 Vector = tuple[float, float, float]
 
@@ -38,6 +41,8 @@ class FineStage(Stage[FineStageSample]):
         retract_um: the way, in the stage's own axes, that takes the tool away from the sample; None if the rig file
             states none.
         retraction_share: how much of `retract_um` was free for the last retraction, 0 to 1.
+        retraction_at_end: whether the last retraction found all axes of `retract_um` at the end of their travel that
+            way already, and nothing else in it.
     """
 
     sample_type = FineStageSample
@@ -50,6 +55,7 @@ class FineStage(Stage[FineStageSample]):
     def __init__(self, name: str, *, clock: Clock, bus: Bus) -> None:
         super().__init__(name, clock=clock, bus=bus)
         self.retraction_share = 1.0
+        self.retraction_at_end = False
         self._retraction: Move[FineStageSample] | None = None
         self._begins_retraction = False
 
@@ -60,6 +66,12 @@ class FineStage(Stage[FineStageSample]):
         return self._begins_retraction or (
             move is not None and move.state == "running" and self.clock.now_ns() < move.deadline_t_ns
         )
+
+    def to_reference(self, axes: Iterable[str]) -> list[str]:
+        """As of any stage; what comes before one of them in the order comes first here, since it clears the way."""
+        order = self.reference_order
+        last = max((order.index(axis) for axis in axes if not self.referenced[axis]), default=-1)
+        return [axis for axis in order[: last + 1] if not self.referenced[axis]]
 
     def tip_um(self, position_um: Mapping[str, float]) -> Vector:
         """Where the tip of the tool is in the rig's frame when the axes are at this position.
@@ -152,7 +164,13 @@ class FineStage(Stage[FineStageSample]):
         share = min(1.0, *(self._free_share(axis, here[axis], length) for axis, length in way.items()))
         targets = {axis: here[axis] + share * length for axis, length in way.items()}
         plan = MotionPlan(kind="retraction", start=here, targets=targets, sweep={}, straight=True)
-        share *= min((rule.free_share(self, plan) for rule in self.rules), default=1.0)
+        allowed = min((rule.free_share(self, plan) for rule in self.rules), default=1.0)
+        self.retraction_at_end = allowed == 1.0 and all(
+            self._room(axis, here[axis], length) <= _END_TOLERANCES * self.axes[axis].tolerance
+            for axis, length in way.items()
+            if length
+        )
+        share *= allowed
         self.retraction_share = share
         if share < 1.0:
             _log.warning("%s: only %.0f %% of retract_um is free", self.name, 100 * share)
@@ -166,6 +184,9 @@ class FineStage(Stage[FineStageSample]):
 
     def _free_share(self, axis: str, position: float, length: float) -> float:
         """How much of a way along one axis its travel allows, 0 to 1."""
+        return math.inf if length == 0 else self._room(axis, position, length) / abs(length)
+
+    def _room(self, axis: str, position: float, length: float) -> float:
+        """How far it is to the end of the travel on the side to which a way leads."""
         limits = self.limits[axis]
-        room = (limits.max - position) if length > 0 else (position - limits.min)
-        return math.inf if length == 0 else max(0.0, room) / abs(length)
+        return max(0.0, (limits.max - position) if length > 0 else (position - limits.min))

@@ -59,6 +59,11 @@ class ToolCarrierSettings(DeviceSettings):
         """Travel of x, y and z."""
 
     @property
+    def homing_ends_um(self) -> Mapping[str, float]:
+        """Where axes stand after a search for references, of those of which the settings tell."""
+        return {}
+
+    @property
     def directions(self) -> Mapping[str, Vector]:
         """Unit vectors of the axes in the rig's frame."""
         return {"x": self.axes_in_rig.x, "y": self.axes_in_rig.y, "z": self.axes_in_rig.z}

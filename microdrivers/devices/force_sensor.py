@@ -85,7 +85,8 @@ class ForceSensor(Device[ForceSample]):
             SaturatedData: a reading was saturated or not valid. RefusedError: the reading drifts.
             LinkError: no or too few readings came. The old zero stays in use then.
         """
-        check_range(duration_s, TARE_DURATIONS_S, what="duration of the tare", unit="s", device=self.name)
+        what = "duration of the tare"
+        check_range(duration_s, TARE_DURATIONS_S, what=what, unit="s", device=self.name, in_file="")
         with self._naming_errors():
             readings = self._collect(duration_s)
             tare = self._zero_from(readings)

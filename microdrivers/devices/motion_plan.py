@@ -50,3 +50,6 @@ class MotionRule(Protocol):
 
     def free_share(self, stage: Stage[Any], plan: MotionPlan) -> float:
         """How much of the way from the start is allowed, 0 to 1."""
+
+    def found_references(self, stage: Stage[Any]) -> None:
+        """A search for references has succeeded; the stage is where the drives have left it."""

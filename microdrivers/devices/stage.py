@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import ClassVar, TypeVar
 
 from microdrivers.core.bus import Bus
@@ -88,6 +88,10 @@ class Stage(Device[PoseT]):
         """The order in which all axes are referenced where nobody names another."""
         return self.axis_names
 
+    def to_reference(self, axes: Iterable[str]) -> list[str]:
+        """What to call `reference()` with so that these axes have their reference, as far as they have none."""
+        return [axis for axis in self.reference_order if axis in set(axes) and not self.referenced[axis]]
+
     def start_axis_to(self, axis: str, position: float, *, speed: float) -> Move[PoseT]:
         """Move one axis by its name, in its own unit (µm, deg) and speed (µm/s, deg/s); otherwise as `start_move_to`.
 
@@ -97,7 +101,8 @@ class Stage(Device[PoseT]):
         if axis not in self.axes:
             raise OutOfRange(f"there is no axis {axis!r}", device=self.name, remedy=f"name one of {list(self.axes)}")
         limits, unit = Range(_SLOWEST_UM_S, self.max_speed[axis]), self.axes[axis].unit
-        check_range(speed, limits, what=f"speed of axis {axis}", unit=f"{unit}/s", device=self.name)
+        what = f"speed of axis {axis}"
+        check_range(speed, limits, what=what, unit=f"{unit}/s", device=self.name, in_file="max")
         return self._command({axis: position}, lambda _start, _targets: {axis: speed})
 
     @property
@@ -141,6 +146,8 @@ class Stage(Device[PoseT]):
                 self._move.refuse_after_stop(stops_before)
                 self._reference_axis(axis)
                 self._publish_event("reference_found", reason=f"axis {axis}")
+        for rule in self.rules:
+            rule.found_references(self)
 
     def stop(self, *, by: str = "user", reason: str = "", remedy: str = "") -> None:
         """Stop all axes now; a running `Move` ends as cancelled, which tells these three."""
@@ -199,7 +206,8 @@ class Stage(Device[PoseT]):
         path_um = math.hypot(*distance.values())
         fastest = min(self.max_speed[axis] for axis in moved)
         asked = fastest if speed_um_s is None else speed_um_s
-        check_range(asked, Range(_SLOWEST_UM_S, fastest), what="speed", unit="µm/s", device=self.name)
+        limits = Range(_SLOWEST_UM_S, fastest)
+        check_range(asked, limits, what="speed", unit="µm/s", device=self.name, in_file="max")
         shares = {axis: distance[axis] / path_um if path_um > 0 else 1.0 for axis in moved}
         return {axis: max(asked * share, self.axes[axis].resolution) for axis, share in shares.items()}
 
@@ -218,7 +226,7 @@ class Stage(Device[PoseT]):
             raise NotReferenced(
                 f"the reference of axis {', '.join(unknown)} is not known, so its limits cannot be kept: it moves "
                 "neither to a position nor by a distance",
-                remedy=f"make sure that the way is free, then reference({unknown!r})",
+                remedy=f"make sure that the way is free, then reference({self.to_reference(unknown)!r})",
             )
 
     def _ask_rules(self, plan: MotionPlan) -> None:

@@ -85,7 +85,9 @@ class XYThetaStage(Stage[XYThetaSample]):
                 fastest = self.max_speed["theta"]
                 asked = fastest if theta_speed_deg_s is None else theta_speed_deg_s
                 limits = Range(_SLOWEST_DEG_S, fastest)
-                speeds["theta"] = check_range(asked, limits, what="theta speed", unit="deg/s", device=self.name)
+                speeds["theta"] = check_range(
+                    asked, limits, what="theta speed", unit="deg/s", device=self.name, in_file="max"
+                )
             return speeds
 
         return self._command({"x": x_um, "y": y_um, "theta": theta_deg}, speeds_of)

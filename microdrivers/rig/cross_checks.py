@@ -16,7 +16,7 @@ from microdrivers.devices.force_sensor_settings import ForceSensorSettings
 from microdrivers.devices.stage import Stage
 from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
-from microdrivers.rig.safety_geometry import distance_um
+from microdrivers.rig.safety_geometry import depth_um, distance_um
 from microdrivers.rig.safety_keep_out import MARGIN_UM
 from microdrivers.rig.validation import suggest
 from microdrivers.rig.yaml_file import Document, Location
@@ -45,6 +45,7 @@ def check_devices_together(
             yield from _check_carrier(name, entry.settings, rig, devices, document)
         if isinstance(entry.settings, ToolCarrierSettings):
             yield from _check_retraction(name, entry.settings, rig, document)
+            yield from _check_homing(name, entry.settings, rig, document)
     yield from _check_probe(rig, devices, document)
 
 
@@ -142,6 +143,29 @@ def _check_retraction(name: str, stage: ToolCarrierSettings, rig: RigFile, docum
             where,
             remedy="turn it round: the way must lead away from the sample; or correct axes_in_rig of the stage",
         )
+
+
+def _check_homing(name: str, stage: ToolCarrierSettings, rig: RigFile, document: Document) -> Iterator[ConfigError]:
+    """A search for references that ends at switches must not leave the tip in a box."""
+    ends_um = stage.homing_ends_um
+    if not set(_AXES) <= set(ends_um):
+        return
+    tip = stage.tip_um((ends_um["x"], ends_um["y"], ends_um["z"]))
+    if tip is None:
+        return
+    for box in rig.safety.keep_out:
+        if depth_um(tip, box.min_um, box.max_um) > 0.0:
+            yield document.error(
+                f"a search for references ends at the limit switches ({_listed(ends_um)} µm), which takes the tip to "
+                f"({', '.join(f'{each:g}' for each in tip)}) µm of the rig's frame, into the keep-out box {box.name!r}",
+                ("devices", name),
+                remedy="let the axes search at the other switch (homing_method), or correct the box or origin_um of "
+                f"{name}",
+            )
+
+
+def _listed(position_um: Mapping[str, float]) -> str:
+    return ", ".join(f"{axis} {position_um[axis]:g}" for axis in _AXES)
 
 
 def _upwards(rig: RigFile) -> int:

@@ -24,6 +24,7 @@ from microdrivers.rig.safety_section import SafetySection
 
 TOPIC = "safety"
 REFUSAL_RULE = "refusal"
+KEEP_OUT_RULE = "keep-out"
 
 _LONGEST_RETRACTION_S = 30.0
 
@@ -103,6 +104,27 @@ class Safety:
     def free_share(self, stage: Stage[Any], plan: MotionPlan) -> float:
         """How much of a way no keep-out box blocks."""
         return self.keep_out.free_share(stage, plan) if isinstance(stage, FineStage) else 1.0
+
+    def found_references(self, stage: Stage[Any]) -> None:
+        """Say if a search for references, whose way is the drives' choice, has ended with the tip inside a box.
+
+        Raises:
+            LinkError: it could not be asked where the stage is.
+        """
+        trapped = self.trapped(stage)
+        if trapped is not None:
+            reason = f"the search for references has ended where no tool may be: {trapped.what}; {trapped.remedy}"
+            self._tell(KEEP_OUT_RULE, reason, stage=stage.name, failed=True)
+
+    def trapped(self, stage: Stage[Any]) -> UnsafeError | None:
+        """What is to be said of a tip that is inside a keep-out box now; None if it is in none, or nobody knows.
+
+        Raises:
+            LinkError: it could not be asked where the stage is.
+        """
+        if not self.keep_out or not isinstance(stage, FineStage) or not all(stage.referenced.values()):
+            return None
+        return self.keep_out.trapped(stage, stage.read().position)
 
     # ------------------------------------------------------------------ the rig's end
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 Point = tuple[float, float, float]
@@ -23,6 +23,30 @@ class Entry(NamedTuple):
 def distance_um(point: Point, low: Point, high: Point) -> float:
     """The largest distance along one axis between a point and a box; 0 inside and on its surface."""
     return max(0.0, *(max(a - p, p - b) for p, a, b in zip(point, low, high, strict=True)))
+
+
+def ways_to_faces_um(point: Point, low: Point, high: Point) -> Mapping[str, float]:
+    """How far it is from a point inside a box to each of its faces, straight through it, by the face's name."""
+    ways: dict[str, float] = {}
+    for axis, p, a, b in zip("xyz", point, low, high, strict=True):
+        ways |= {f"-{axis}": p - a, f"+{axis}": b - p}
+    return ways
+
+
+def depth_um(point: Point, low: Point, high: Point) -> float:
+    """How far it is from a point inside a box to its nearest face; negative outside."""
+    return min(ways_to_faces_um(point, low, high).values())
+
+
+def deepens(start: Point, end: Point, low: Point, high: Point) -> bool:
+    """Whether the straight way from inside a box gets deeper into it than it begins.
+
+    The depth is the least of linear functions and so concave along the way: if it does not rise at first, it never
+    does.
+    """
+    before, after = ways_to_faces_um(start, low, high), ways_to_faces_um(end, low, high)
+    depth = min(before.values())
+    return min(after[face] - way for face, way in before.items() if way <= depth + _TOUCH) > _TOUCH
 
 
 def entry_of(start: Point, end: Point, low: Point, high: Point) -> Entry | None:

@@ -9,11 +9,12 @@ from pathlib import Path
 
 from microdrivers.core.errors import ErrorTree, MicrodriversError
 
-_CALL = re.compile(r"\b(reference|clear_fault|retract|stop)\((\[[^\]]*\])?\)")
+_CALL = re.compile(r"\b(reference|clear_fault|retract|stop|move_by)\((\[[^\]]*\]|d\w+=[^)]*)?\)")
+_SHIFT = re.compile(r"d(\w+)_(um|deg)=([^,]+)")
 
 
 def as_commands(remedy: str, file: Path, device: str) -> str:
-    """A remedy with `clear_fault()`, `reference([…])`, `retract()` and `stop()` replaced by the commands that do them.
+    """A remedy with `clear_fault()`, `reference([…])`, `retract()`, `stop()` and `move_by(…)` replaced by commands.
 
     Args:
         remedy: of an error.
@@ -31,6 +32,9 @@ def as_commands(remedy: str, file: Path, device: str) -> str:
         if what == "reference":
             named = f" --axes {','.join(ast.literal_eval(axes))}" if axes else ""
             return f"`microdrivers reference {rig} --device {name}{named}`"
+        if what == "move_by":
+            options = " ".join(f"--{axis}-{unit} {way}" for axis, unit, way in _SHIFT.findall(axes or ""))
+            return f"`microdrivers move {rig} {name} --by {options}`"
         if what == "retract":
             return f"`microdrivers move {rig} {name} --retract`"
         return f"`microdrivers clear-fault {rig} {name}`"

@@ -46,6 +46,16 @@ def test_a_rig_section_is_read():
 
 
 @pytest.mark.parametrize(
+    ("method", "direction", "end_um"),
+    [(17, 1, -100.0), (1, 1, -100.0), (18, 1, 600.0), (2, 1, 600.0), (17, -1, 600.0), (18, -1, -100.0), (37, 1, None)],
+)
+def test_a_search_at_a_limit_switch_ends_at_that_end_of_the_travel(method, direction, end_um):
+    changes = {"homing_method": method, "direction": direction, "travel_um": [-100, 600]}
+    found = FineStageSettings.model_validate_json(json.dumps(_rig_section(axes=_axes(**changes))))
+    assert found.homing_ends_um == {"x": -625.0, "z": -625.0} | ({} if end_um is None else {"y": end_um})
+
+
+@pytest.mark.parametrize(
     ("changes", "says"),
     [
         ({"axes": _axes(node_id=11)}, r"different node ids, not \[11, 11, 13\]"),

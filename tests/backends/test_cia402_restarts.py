@@ -15,7 +15,7 @@ from microdrivers.core.errors import (
     ReferenceLost,
 )
 from microdrivers.fakes.can import Frame
-from tests.backends.cia402_bench import Bench
+from tests.backends.cia402_bench import NODES, Bench
 from tests.backends.cia402_peer import ENABLED, FAULT
 
 MS = 1_000_000
@@ -64,6 +64,39 @@ def test_a_drive_that_restarts_in_a_move():
         as_far_um = bench.stage.read().x_um
         assert bench.stage.move_to(x_um=0.0, y_um=-as_far_um, speed_um_s=500.0).on_target
         assert bench.peers["y"].number(0x6083, 0) == 200_000  # it has forgotten what it was told before
+
+
+def test_drives_that_lose_their_power_together_are_all_named_and_referenced_in_the_order():
+    with Bench() as bench:
+        bench.referenced()
+        for axis in bench.peers:
+            bench.medium.detach(bench.peers[axis])
+        bench.clock.sleep(0.3)
+        with pytest.raises(LinkLost) as lost:
+            bench.stage.move_to(x_um=0.0)
+        for axis, node in NODES.items():
+            assert f"axis {axis} (node {node})" in lost.value.what
+        for axis in tuple(bench.peers):
+            bench.replace_detached(axis)
+        bench.clock.sleep(0.5)
+        with pytest.raises(NotReferenced, match="axis y") as caught:
+            bench.stage.move_to(y_um=0.0)
+        assert "reference(['z', 'x', 'y'])" in caught.value.remedy
+        with pytest.raises(NotReferenced, match="axis x") as caught:
+            bench.stage.move_to(x_um=0.0)
+        assert "reference(['z', 'x'])" in caught.value.remedy
+        bench.stage.reference(["z", "x"])
+        assert bench.stage.move_to(x_um=0.0).on_target
+
+
+def test_all_that_have_restarted_are_named_and_are_to_be_referenced():
+    with Bench() as bench:
+        bench.referenced()
+        for axis in ("y", "z"):
+            bench.stage._drives.by_axis[axis].forget()
+        with pytest.raises(LinkLost, match=r"axis y \(node 12\), axis z \(node 13\) have restarted") as caught:
+            bench.stage._guard.refuse()
+        assert "reference(['z', 'y'])" in caught.value.remedy
 
 
 def test_a_restart_is_noticed_without_asking_and_the_stream_goes_on():

@@ -122,6 +122,14 @@ def test_doctor_shows_the_bus_with_load_and_counters(run, rig_file):
     assert re.search(r"3 devices: \d+ OK, 2 warnings, no problems", result.stdout.splitlines()[-1])
 
 
+def test_doctor_says_nothing_of_a_bus_that_could_not_be_opened(run, rig_file):
+    result = run("doctor", rig_file)
+    assert result.exit_code == 1
+    assert result.stdout.count("CAN bus can0 (socketcan) cannot be opened") == 3
+    assert "since it was opened" not in result.stdout
+    assert "shared by" not in result.stdout
+
+
 def test_doctor_as_json_holds_the_bus(run, rig_file, disturbed):
     disturbed(without_gripper_y)
     result = run("doctor", rig_file, "--fake", "--json")
@@ -146,6 +154,22 @@ def test_move_references_an_emulated_stage_and_ends_on_target(run, rig_file):
     assert "x 20.00 µm" in result.stdout
     assert "z -30.05 µm" in result.stdout
     assert "referencing z, x, y" in result.stderr
+
+
+@pytest.mark.parametrize(("box_from_um", "code"), [(8000, 1), (8600, 0)])
+def test_a_search_for_references_that_ends_in_a_keep_out_box_fails_and_names_the_way_out(
+    run, rig_file, box_from_um, code
+):
+    data = yaml.safe_load(rig_file.read_text(encoding="utf-8"))
+    holder = {"name": "holder", "min_um": [box_from_um, 7200, -5000], "max_um": [8800, 8000, 5000]}
+    data["safety"] = {"force_guards": "none", "keep_out": [holder]}
+    data["devices"]["probe_stage"]["axes"]["y"]["homing_method"] = 37
+    rig_file.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    result = run("reference", rig_file, "--device", "probe_stage", "--fake")
+    assert result.exit_code == code, result.output
+    assert "z, x, y referenced" in result.stdout
+    assert ("the tip is in the keep-out box 'holder'" in result.stderr) == bool(code)
+    assert (f"microdrivers move {rig_file} probe_stage --by --y-um" in result.stderr.replace("\n", " ")) == bool(code)
 
 
 def test_stop_tells_all_drives_and_no_sensor(run, rig_file, disturbed):

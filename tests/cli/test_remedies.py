@@ -24,6 +24,10 @@ LAB = Path("lab.yaml")
     [
         ("then clear_fault()", "then `microdrivers clear-fault lab.yaml probe_stage`"),
         ("reference(['z', 'x'])", "`microdrivers reference lab.yaml --device probe_stage --axes z,x`"),
+        (
+            "move_by(dx_um=-3, dz_um=110.5) leads out",
+            "`microdrivers move lab.yaml probe_stage --by --x-um -3 --z-um 110.5` leads out",
+        ),
         ("then reference() again", "then `microdrivers reference lab.yaml --device probe_stage` again"),
         ("stop() and retract()", "`microdrivers stop lab.yaml` and `microdrivers move lab.yaml probe_stage --retract`"),
         ("read() a fresh one", "read() a fresh one"),

@@ -20,6 +20,24 @@ def test_nothing_is_clipped():
         check_range(1.00001, Range(0, 1), what="x", unit="µm")
 
 
+@pytest.mark.parametrize(
+    ("value", "in_file", "correctable"),
+    [
+        (2.0, "both", True),
+        (0.0, "both", True),
+        (2.0, "max", True),
+        (0.0, "max", False),
+        (2.0, "", False),
+        (0.0, "", False),
+    ],
+)
+def test_only_limits_that_the_rig_file_states_are_to_be_corrected_there(value, in_file, correctable):
+    with pytest.raises(OutOfRange) as caught:
+        check_range(value, Range(0.5, 1.0), what="speed", unit="µm/s", in_file=in_file)
+    assert "choose a value inside the limits" in caught.value.remedy
+    assert ("rig file" in caught.value.remedy) == correctable
+
+
 def test_limits_of_zero_are_limits():
     assert 0.0 in Range(0, 0)
     assert 1e-9 not in Range(0, 0)

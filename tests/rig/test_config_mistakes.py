@@ -211,6 +211,10 @@ MISTAKES = {
     "ready in a box": (
         READY, "ready_um: [-390, 0, -600]", "probe.ready_um", "in the keep-out box 'slide'", "origin_um of",
     ),
+    "references found in a box": (
+        ORIGIN, "origin_um: [7950, 7500, -1200]", PROBE, "(8575, 6875, -575) µm of the rig's frame, into the keep-out "
+        "box 'slide'", "homing_method",
+    ),
     "ready beside a box": (READY, "ready_um: [-390, 0, -498]", "probe.ready_um", "nearer to it than 5 µm", ""),
     "retraction beyond the travel": (
         RETRACT, "retract_um: [4000, 0, 0]", f"{PROBE}.retract_um.0", "the whole travel", "unit",

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from microdrivers.core.errors import NotReferenced, UnsafeError
 from microdrivers.core.units import Range
 from microdrivers.devices.motion_plan import MotionPlan
-from microdrivers.rig.safety_geometry import distance_um, entry_of, sweep_meets
+from microdrivers.rig.safety_geometry import deepens, distance_um, entry_of, sweep_meets
 from microdrivers.rig.safety_keep_out import MARGIN_UM, KeepOut
 from microdrivers.rig.safety_section import KeepOutBox
 from tests.rig.guarded_rig import STAGE, guarded_rig
@@ -139,13 +139,34 @@ def test_what_passes_stays_out_and_what_is_refused_came_near(directions, origin,
     depths = depth_um(np.array(origin) + places @ np.array(axes), *box)
     clear_um = distance_um(stage.tip_um(positions[0]), *box)
     margin_um = min(MARGIN_UM, clear_um)
+    began_um = depth_um(np.array(stage.tip_um(positions[0])), *box)
     try:
         rule.check(stage, plan)
     except UnsafeError:
         grain_um = 3 * math.dist(start, end) / (500 if straight else 12) + 1e-3
-        assert depths.max() > -margin_um - grain_um or not straight
+        if straight and began_um > 0.0:
+            assert depths.max() > began_um or max(0.0, depths[-1]) >= began_um - 1e-9
+        else:
+            assert depths.max() > -margin_um - grain_um or not straight
     else:
-        assert depths.max() <= -margin_um + 1e-3
+        if straight and began_um > 0.0:
+            assert depths.max() <= began_um + 1e-6
+            assert depths[-1] < began_um
+        else:
+            assert depths.max() <= -margin_um + 1e-3
+
+
+@settings(max_examples=100)
+@given(point, boxes(), st.tuples(*[st.floats(0.02, 0.98)] * 3))
+def test_a_straight_way_from_inside_deepens_where_sampling_finds_it_deeper(end, box, shares):
+    low, high = np.array(box[0]), np.array(box[1])
+    start = low + np.array(shares) * (high - low)
+    depths = depth_um(start + np.linspace(0.0, 1.0, 501)[:, None] * (np.array(end) - start), *box)
+    deeper = depths.max() > depths[0] + 1e-6
+    if deeper:
+        assert deepens(tuple(start), end, *box)
+    elif deepens(tuple(start), end, *box):  # for less than a step, or by next to nothing
+        assert depths.max() + math.dist(start, end) / 500 > depths[0]
 
 
 SLIDE = {"name": "slide", "min_um": [0, 0, -5000], "max_um": [15000, 15000, -200]}
@@ -233,16 +254,62 @@ def test_a_tool_is_taken_away_as_far_as_the_boxes_let_it(kept, caplog):
     assert "only 11 % of retract_um is free" in caplog.text
 
 
-def test_from_within_a_box_the_tool_is_only_taken_away(tmp_path):
-    around = {"name": "around", "min_um": [7900, 7400, -100], "max_um": [8000, 7600, 100]}
-    with guarded_rig(tmp_path, safety={"force_guards": "none", "keep_out": [around]}) as kept:
-        with pytest.raises(
-            UnsafeError, match=r"the tip is in the keep-out box 'around' already, at \(7950.0"
-        ) as caught:
-            kept.stage.move_to(x_um=1.0)
-        assert "retract() takes the tool away" in caught.value.remedy
-        kept.stage.retract().wait()
-        kept.stage.move_to(x_um=300.0)
+AROUND = {"name": "around", "min_um": [7900, 7400, -5000], "max_um": [8100, 7600, 100]}
+"""The tip at (7950, 7500, 0): 50 µm from the −x face, 100 from the top and from ±y."""
+
+
+@pytest.fixture
+def trapped(tmp_path):
+    """The probe within a box, where its references are."""
+    with guarded_rig(tmp_path, safety={"force_guards": "none", "keep_out": [AROUND]}) as rig:
+        yield rig
+
+
+@pytest.mark.parametrize("way", [{"dx_um": -60.0}, {"dx_um": -20.0}, {"dz_um": 300.0}, {"dx_um": -20.0, "dy_um": 10.0}])
+def test_from_within_a_box_a_straight_way_out_is_free(trapped, way):
+    pose = trapped.stage.move_by(**way)
+    assert [pose.position[name[1]] for name in way] == pytest.approx(list(way.values()), abs=0.2)
+
+
+@pytest.mark.parametrize("way", [{"dx_um": 5.0}, {"dx_um": 400.0}, {"dz_um": 20.0}, {"dz_um": -20.0}])
+def test_from_within_a_box_no_way_leads_deeper_or_about(trapped, way):
+    with pytest.raises(
+        UnsafeError, match=r"in the keep-out box 'around' already, at \(79.*does not lead out"
+    ) as caught:
+        trapped.stage.move_by(**way)
+    assert "move_by(dx_um=-60) leads out through its -x face; retract()" in caught.value.remedy
+    assert trapped.true_x_um() == 0.0
+
+
+def test_from_within_a_box_no_way_leads_into_another(tmp_path):
+    beside = {"name": "beside", "min_um": [7700, 7400, -5000], "max_um": [7890, 7600, 5000]}
+    with guarded_rig(tmp_path, safety={"force_guards": "none", "keep_out": [AROUND, beside]}) as kept:
+        with pytest.raises(UnsafeError, match="'beside'"):
+            kept.stage.move_by(dx_um=-60.0)
+        with pytest.raises(UnsafeError, match="'around'") as caught:
+            kept.stage.move_by(dx_um=5.0)
+        assert "move_by(dz_um=110)" in caught.value.remedy or "move_by(dy_um=" in caught.value.remedy
+
+
+def test_a_move_that_does_not_start_from_rest_does_not_lead_out(trapped):
+    trapped.stage.start_move_to(z_um=300.0, speed_um_s=20.0)
+    trapped.clock.sleep(1.0)
+    with pytest.raises(UnsafeError, match="does not start from rest"):
+        trapped.stage.start_move_to(z_um=400.0)
+
+
+def test_from_within_a_box_the_tool_is_taken_away(trapped):
+    trapped.stage.retract().wait()
+    trapped.stage.move_to(x_um=300.0)
+
+
+def test_a_search_for_references_that_ends_within_a_box_is_told_with_the_way_out(trapped, caplog):
+    assert trapped.rules() == ["keep-out"]
+    assert "ended where no tool may be" in trapped.interventions[0].reason
+    assert "move_by(dx_um=-60) leads out" in trapped.interventions[0].reason
+    trapped.stage.move_by(dx_um=-60.0)
+    trapped.stage.reference(["y"])
+    assert trapped.rules() == ["keep-out"]
 
 
 def test_the_tip_is_where_holder_and_axes_say(tmp_path):
