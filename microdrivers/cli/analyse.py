@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.main import EXIT_ERROR, EXIT_INTERRUPTED
 from microdrivers.cli.progress import TerminalProgress
 
 
@@ -23,8 +23,8 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
     """Run the analysis again that each recording of RUNS holds, and write a table of results, one row a recording.
 
     RUNS are recordings, or folders with some in or below them. Optical calibrations and force characterisations are
-    estimated anew from what was recorded. A file that cannot be analysed has a row that says why. After Ctrl-C or a
-    kill, the same command goes on where it was.
+    estimated anew from what was recorded. A file that cannot be analysed has a row that says why; the exit status
+    is 1 if that is so of all of them. After Ctrl-C or a kill, the same command goes on where it was.
 
     \b
     Examples:
@@ -53,3 +53,5 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
     for row in report.rows:
         if row["error"] is not None:
             click.echo(f"  {row['file']}: {row['error']}", err=True)
+    if report.failed == len(report.rows):
+        sys.exit(EXIT_ERROR)

@@ -18,6 +18,7 @@ from microdrivers.cli.output import (
     prepare_folder,
     recorded_as,
     recording_options,
+    refuse_options_given,
     start_recording,
     tell_flaws,
 )
@@ -85,9 +86,9 @@ def optics(
 
     if images is not None and replay is not None:
         raise ConfigError("--images and --replay exclude each other", remedy="leave out one of them")
-    if (images or replay) is not None and (rig_file is not None or fake or real_time or wire_log is not None):
+    if images is not None or replay is not None:
         option = "--images" if images is not None else "--replay"
-        raise ConfigError(f"{option} replaces the rig", remedy="leave out --rig, --fake, --real-time and --wire-log")
+        refuse_options_given(f"{option} replaces the rig", allowed=("images", "replay", "out", "as_json"))
     progress = TerminalProgress(quiet=as_json)
     try:
         if images is not None:
@@ -174,7 +175,8 @@ def _run(
     from microdrivers.routines.optics.calibration import build_result
     from microdrivers.routines.provenance import describe_run
 
-    folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics")
+    out = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics"
+    folder = prepare_folder(out, new=known["clock"] == "recorded")
     truth = OpticsTruthCollector(source.bus)
     recorder: Recorder | None = None
 

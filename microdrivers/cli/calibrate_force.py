@@ -19,6 +19,7 @@ from microdrivers.cli.output import (
     prepare_folder,
     recorded_as,
     recording_options,
+    refuse_options_given,
     start_recording,
     tell_flaws,
 )
@@ -94,12 +95,13 @@ def force(
     progress = TerminalProgress(quiet=as_json)
     try:
         if table is not None or replay is not None:
-            _refuse_rig_options(table, replay, rig_file, fake or real_time, wire_log or calibration)
+            _refuse_rig_options(table, replay)
         if table is not None:
             complete = _from_table(table, specimen, out, as_json, progress)
         elif replay is not None:
             complete = _from_recording(replay, check, out, as_json, progress)
         else:
+            _check_figures(press)
             emulated = fake or rig_file is None
             if not emulated and not yes:
                 click.confirm(_QUESTION, abort=True, err=True)
@@ -116,18 +118,20 @@ def force(
         sys.exit(EXIT_INTERRUPTED)
 
 
-def _refuse_rig_options(
-    table: Path | None, replay: Path | None, rig_file: Path | None, emulated: bool, other: Path | None
-) -> None:
+def _check_figures(press: dict[str, Any]) -> None:
+    """Before anything is asked or opened."""
+    from microdrivers.routines.force import PressSettings
+
+    PressSettings(**press).check()
+
+
+def _refuse_rig_options(table: Path | None, replay: Path | None) -> None:
     from microdrivers.core.errors import ConfigError
 
     if table is not None and replay is not None:
         raise ConfigError("--csv and --replay exclude each other", remedy="leave out one of them")
-    if rig_file is not None or emulated or other is not None:
-        option = "--csv" if table is not None else "--replay"
-        raise ConfigError(
-            f"{option} replaces the rig", remedy="leave out --rig, --fake, --real-time, --wire-log and --calibration"
-        )
+    option, of_its_own = ("--csv", "specimen") if table is not None else ("--replay", "check")
+    refuse_options_given(f"{option} replaces the rig", allowed=("table", "replay", "out", "as_json", "yes", of_its_own))
 
 
 def _from_recording(file: Path, check: bool, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
@@ -212,7 +216,8 @@ def _run(
     from microdrivers.report.force_truth import ContactTruthCollector
     from microdrivers.routines.force import Characterisation
 
-    folder = prepare_folder(out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force")
+    out = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force"
+    folder = prepare_folder(out, new=known["clock"] == "recorded")
     truth = ContactTruthCollector(source.bus)
     recorder: Recorder | None = None
 
@@ -246,7 +251,7 @@ def _run(
         click.echo(force_summary(result))
         files = f"result.json, specimen.yaml, record.csv, report.html{recorded_as(recorder)}"
         click.echo(f"\nwritten to {folder}/: {files}")
-    return run.complete
+    return not characterisation.interrupted
 
 
 def _write(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from microdrivers.cli.output import tell_flaws
+from microdrivers.cli.output import tell_flaws, topic_patterns
 from microdrivers.cli.progress import TerminalProgress
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def export(file: Path, to: str, topics: tuple[str, ...], out: Path | None) -> No
     from microdrivers.recording.export import export_recording
     from microdrivers.recording.reader import Recording
 
-    patterns = [name.strip() for names in topics for name in names.split(",") if name.strip()] or None
+    patterns = topic_patterns(topics)
     progress = TerminalProgress()
     try:
         with Recording(file) as recording:

@@ -47,6 +47,7 @@ def describe(recording: Recording) -> dict[str, Any]:
     from microdrivers.recording.views import start_ns
 
     begin_ns = start_ns(recording)
+    lost = [*map(str, recording.losses), *recording.drops]
     topics: dict[str, dict[str, Any]] = {}
     for name, topic in recording.topics.items():
         topics[name] = {
@@ -63,7 +64,8 @@ def describe(recording: Recording) -> dict[str, Any]:
     return {
         "file": str(recording.file),
         "bytes": recording.file.stat().st_size,
-        "complete": recording.complete,
+        "ended": recording.complete,
+        "complete": recording.complete and not lost,
         "duration_s": max((last_s for last_s in ends if last_s is not None), default=0.0),
         "start_ns": begin_ns,
         "header": msgspec.structs.asdict(recording.header),
@@ -71,13 +73,15 @@ def describe(recording: Recording) -> dict[str, Any]:
         "topics": topics,
         "arrivals": {host: len(orders) for host, orders in recording.arrivals.items()},
         "attachments": {name: len(data) for name, data in recording.attachments.items()},
-        "losses": [str(loss) for loss in recording.losses],
+        "losses": lost,
     }
 
 
 def _as_text(found: dict[str, Any]) -> str:
     header = found["header"]
-    ended = "complete" if found["complete"] else "not ended: its program was killed, or the file was cut off"
+    ended = "complete" if found["complete"] else "NOT COMPLETE: see what it has lost, below"
+    if not found["ended"]:
+        ended = "not ended: its program was killed, or the file was cut off"
     lines = [
         f"{found['file']}: {found['bytes'] / 1e6:.1f} MB, {found['duration_s']:.3f} s, {ended}",
         f"  made       {header['created_utc'] or 'unknown'} by microdrivers {header['microdrivers'] or 'unknown'}"

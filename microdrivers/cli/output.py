@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import json
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
+from click.core import ParameterSource
 
 if TYPE_CHECKING:
     from microdrivers.core.bus import Bus
@@ -19,13 +20,65 @@ if TYPE_CHECKING:
     from microdrivers.rig import Rig
 
 RECORDING = "run.mcap"
+RESULT = "result.json"
 COMPRESSION_HELP = "without loss: a third to a half smaller, 3 to 10 ms of processor time a megapixel."
 
 
-def prepare_folder(folder: Path) -> Path:
-    """Find out before the experiment whether its result can be written."""
+def topic_patterns(topics: Sequence[str]) -> list[str] | None:
+    """The names and patterns of all `--topics`; None if that was not given.
+
+    Raises:
+        ConfigError: it was given, and names nothing.
+    """
     from microdrivers.core.errors import ConfigError
 
+    patterns = [name.strip() for names in topics for name in names.split(",") if name.strip()]
+    if topics and not patterns:
+        raise ConfigError("--topics names no topic", remedy="name some, or leave out --topics for all of them")
+    return patterns or None
+
+
+def refuse_options_given(reason: str, *, allowed: Collection[str]) -> None:
+    """Refuse what the user has given beside an option that makes it void.
+
+    Args:
+        reason: what that option does, as `--images replaces the rig`.
+        allowed: names of the parameters that keep their meaning.
+
+    Raises:
+        ConfigError: something else was given on the command line.
+    """
+    from microdrivers.core.errors import ConfigError
+
+    context = click.get_current_context()
+    given = [
+        max(parameter.opts, key=len)
+        for parameter in context.command.params
+        if parameter.name is not None
+        and parameter.name not in allowed
+        and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
+    ]
+    if given:
+        raise ConfigError(f"{reason}, and there is no experiment to drive", remedy=f"leave out {', '.join(given)}")
+
+
+def prepare_folder(folder: Path, *, new: bool) -> Path:
+    """Find out before the experiment whether its result can be written.
+
+    Args:
+        folder: which need not exist.
+        new: whether it must hold no result yet; of a live run that is recorded, its recording sees to that.
+
+    Raises:
+        ConfigError: it cannot, or another result is there.
+    """
+    from microdrivers.core.errors import ConfigError
+
+    if new and (folder / RESULT).exists():
+        raise ConfigError(
+            f"a {RESULT} is there, and a result is never written over", file=str(folder),
+            remedy="choose another --out folder",
+        )  # fmt: skip
     existed = folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)

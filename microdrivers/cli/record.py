@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+import math
+import os
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from microdrivers.cli.main import EXIT_ERROR
-from microdrivers.cli.output import COMPRESSION_HELP
+from microdrivers.cli.output import COMPRESSION_HELP, topic_patterns
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from microdrivers.core.clock import Clock
     from microdrivers.devices.base import Device
@@ -25,6 +28,12 @@ _LINE_PERIOD_S = 1.0
 _PLAIN_LINE_PERIOD_S = 10.0
 
 
+def _finite(_context: click.Context, _parameter: click.Parameter, duration_s: float | None) -> float | None:
+    if duration_s is not None and not math.isfinite(duration_s):
+        raise click.BadParameter(f"{duration_s} is no time; without --for a recording goes on until Ctrl-C.")
+    return duration_s
+
+
 @click.command(short_help="Record what every device tells, frames included; nothing moves.")
 @rig_options
 @click.option(
@@ -32,8 +41,9 @@ _PLAIN_LINE_PERIOD_S = 10.0
     help="Record these alone, separated by commas; patterns are allowed. Default: all but the bytes on wires.",
 )  # fmt: skip
 @click.option(
-    "--for", "duration_s", type=click.FloatRange(min=0, min_open=True), metavar="S", help="End after S seconds."
-)
+    "--for", "duration_s", type=click.FloatRange(min=0, min_open=True), callback=_finite, metavar="S",
+    help="End after S seconds.",
+)  # fmt: skip
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="FILE", help="New file to write; default: RIG-DATE.mcap."
 )
@@ -56,7 +66,7 @@ def record(
 
     Force comes at its sensor's rate, frames at their camera's, poses at 100 Hz, the zoom at 70 Hz. The file is
     complete after Ctrl-C, and whatever kills the program costs the last 0.1 s: see `microdrivers recording repair`.
-    If samples could not be written, they are counted, and the exit status is 1.
+    If samples could not be written, they are counted, and the exit status is 1; so it is if one of NAMES met no topic.
 
     \b
     Examples:
@@ -75,9 +85,14 @@ def record(
         raise ConfigError(
             "a simulation runs as fast as it can, and would fill the disk", remedy="add --for S, or --real-time"
         )
-    patterns = [name.strip() for names in topics for name in names.split(",") if name.strip()] or None
+    patterns = topic_patterns(topics)
     rig = choice.build(real_time=real_time)
     try:
+        if patterns is not None and len(_unmet(patterns, rig.bus.topics)) == len(patterns):
+            raise ConfigError(
+                f"there is no topic {_quoted(patterns)}, and nothing would be recorded",
+                remedy=_similar(patterns, rig.bus.topics),
+            )
         header = describe_recording(
             source="fake" if rig.fake or rig.file.emulated else "live", rig=rig.file.name,
             seed=(choice.seed or 0) if choice.fake else None,
@@ -86,6 +101,7 @@ def record(
             out or _default_file(rig), bus=rig.bus, clock=rig.clock, header=header, topics=patterns,
             on_failure="stop" if on_failure == "stop" else "go_on", compress_images=compress_images,
         )  # fmt: skip
+        made = recorder.file.stat()
     except BaseException:
         rig.close()
         raise
@@ -99,9 +115,39 @@ def record(
             _run(rig.clock, recorder, duration_s)
     except KeyboardInterrupt:
         ended_by_user = True
-    _tell(recorder, interrupted=ended_by_user)
-    if any(count.dropped for count in recorder.counts.values()):
+    gone = not _is_still(made, recorder.file)
+    _tell(recorder, interrupted=ended_by_user, gone=gone)
+    unmet = _unmet(patterns or (), rig.bus.topics)
+    if unmet:
+        click.echo(f"there was no topic {_quoted(unmet)}: {_similar(unmet, rig.bus.topics)}", err=True)
+    if gone or unmet or any(count.dropped for count in recorder.counts.values()):
         sys.exit(EXIT_ERROR)
+
+
+def _is_still(made: os.stat_result, file: Path) -> bool:
+    """Whether that file is the one that was made."""
+    try:
+        return os.path.samestat(made, file.stat())
+    except OSError:
+        return False
+
+
+def _unmet(patterns: Collection[str], topics: Collection[str]) -> list[str]:
+    """Those of the patterns that ask for none of the topics."""
+    from microdrivers.recording.channels import is_wanted
+
+    return [pattern for pattern in patterns if not any(is_wanted(topic, [pattern]) for topic in topics)]
+
+
+def _quoted(patterns: Collection[str]) -> str:
+    return ", ".join(map(repr, patterns))
+
+
+def _similar(patterns: Collection[str], topics: Collection[str]) -> str:
+    """What to ask for instead."""
+    close = dict.fromkeys(name for pattern in patterns for name in difflib.get_close_matches(pattern, topics, n=1))
+    meant = f"did you mean {_quoted(close)}? " if close else ""
+    return f"{meant}topics of this rig: {', '.join(topics)}"
 
 
 def _default_file(rig: Rig) -> Path:
@@ -157,10 +203,12 @@ def _line(
     return f"{elapsed_s:.0f} s | {recorder.size / 1e6:.1f} MB | {lost} | {rates or 'nothing'}"
 
 
-def _tell(recorder: Recorder, *, interrupted: bool) -> None:
+def _tell(recorder: Recorder, *, interrupted: bool, gone: bool) -> None:
     how = "ended by you; the file is complete" if interrupted else "complete"
     if recorder.failure is not None:
         how = f"could not be written all the time: {recorder.failure.strerror or recorder.failure}"
+    if gone:
+        how = "gone: while it was written somebody has removed, renamed or replaced it, or its disk"
     click.echo(f"{recorder.file}: {recorder.size / 1e6:.1f} MB, {how}")
     width = max(map(len, recorder.counts), default=0)
     for topic, count in recorder.counts.items():

@@ -23,7 +23,14 @@ def repair(file: Path, out: Path | None) -> None:
     """
     from microdrivers.recording.repair import repair as write_repaired
 
-    report = write_repaired(file, out or file.with_name(f"{file.stem}.repaired.mcap"))
+    target = out or file.with_name(f"{file.stem}.repaired.mcap")
+    existed = target.exists()
+    try:
+        report = write_repaired(file, target)
+    except KeyboardInterrupt:
+        if not existed:
+            target.unlink(missing_ok=True)
+        raise
     click.echo(f"{report.out}: {sum(report.messages.values())} messages kept")
     width = max(map(len, report.messages), default=0)
     for topic, number in report.messages.items():

@@ -56,8 +56,12 @@ def write_contact_sheet(recording: Recording, file: Path, *, frames: int = 12, c
     done, data = cv2.imencode(".png", np.vstack(blocks))
     assert done
     try:
-        with file.open("xb") as stream:
-            stream.write(data.tobytes())
+        file.touch(exist_ok=False)
+        try:
+            file.write_bytes(data.tobytes())
+        except BaseException:
+            file.unlink()  # half a picture is none
+            raise
     except OSError as error:
         raise ConfigError(
             f"the contact sheet cannot be written: {error.strerror}", file=str(file), remedy="choose another new file"

@@ -20,6 +20,8 @@ SCHEMA_VERSION = 1
 PROFILE = "microdrivers"
 HEADER_RECORD = "microdrivers"
 CLOCK_RECORD = "clock"
+REPAIR_RECORD = "repair"
+FAILURE_RECORD = "failure"
 
 _CHECKSUM = "crc32"
 _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)

@@ -19,7 +19,7 @@ from microdrivers.recording.table import Table
 
 COLUMNS = ("time_s", "indentation_um", "force_uN")
 
-INVALID_READING = frozenset({"DISCONNECTED"})
+INVALID_READING = frozenset({"NOT_MEASURED"})
 
 
 class IndentationTable:

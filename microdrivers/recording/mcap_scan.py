@@ -24,6 +24,8 @@ from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
 from microdrivers.recording.mcap_writer import CHUNK, MAGIC, RECORD
 
+NOT_ENDED = "the recording was not ended: its last 0.1 s may be missing"
+
 _INDEX = struct.Struct("<BQHI")
 _FOOTER_SIZE = 29
 _BLOCK_BYTES = 1 << 20
@@ -157,7 +159,7 @@ class McapScan:
             else:
                 offset += length
         if self.size:
-            self.losses.append(Loss(self.size, 0, "the recording was not ended: its last 0.1 s may be missing"))
+            self.losses.append(Loss(self.size, 0, NOT_ENDED))
 
     def _take_up(self, head: bytes, offset: int, length: int) -> bool:
         """Take up the record that begins with `head`; False if it is damaged, and perhaps its length too."""

@@ -19,19 +19,24 @@ from microdrivers.recording.channels import ARRIVALS_TOPIC
 from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording
 from microdrivers.recording.header import (
     CLOCK_RECORD,
+    FAILURE_RECORD,
     HEADER_RECORD,
     PROFILE,
+    REPAIR_RECORD,
     SCHEMA_VERSION,
     ClockMapping,
     RecordingHeader,
     from_metadata,
 )
-from microdrivers.recording.mcap_scan import ChunkPlace, Loss, McapScan, read_definition
+from microdrivers.recording.mcap_scan import NOT_ENDED, ChunkPlace, Loss, McapScan, read_definition
 from microdrivers.recording.mcap_writer import MESSAGE, MESSAGE_BEGIN, RECORD
 from microdrivers.recording.recorded_channels import Action, ChannelReader, FrameJoin, Unreadable, channel_reader
 from microdrivers.recording.survey import Survey, TopicSummary
 
 __all__ = ["Recording", "TopicSummary"]
+
+LIST_MARK = "; "
+"""Between the losses in a repaired file's metadata."""
 
 FoundT = TypeVar("FoundT")
 
@@ -49,7 +54,7 @@ class Recording:
 
     Attributes:
         header: where it comes from. clock: how its times relate to the calendar's; None if that is damaged.
-        complete: whether it was ended; if not, its writer was killed or the file was cut off.
+        complete: whether it was ended; if not, its writer was killed or the file was cut off, perhaps before a repair.
 
     Raises:
         ConfigError: there is no such file, or it may not be read.
@@ -61,7 +66,8 @@ class Recording:
     def __init__(self, file: Path) -> None:
         self.file = file
         self._scan = open_scan(file)
-        self.complete = self._scan.complete
+        self._told = list(_told_losses(self._scan))
+        self.complete = self._scan.complete and not any(NOT_ENDED in loss.what for loss in self._told)
         self.header = read_header(self._scan)
         clocks = [record.metadata for record in self._scan.metadata if record.name == CLOCK_RECORD]
         read = [clock for data in clocks if (clock := from_metadata(data, ClockMapping)) is not None]
@@ -114,11 +120,28 @@ class Recording:
 
     @property
     def losses(self) -> list[Loss]:
-        """All that cannot be read, damaged or cut off; the first look at it reads all of the file."""
+        """All that cannot be read, damaged or cut off, and what the file itself tells of that.
+
+        The latter is what was lost before a repair, or that its disk ended it. The first look at it reads all of the
+        file.
+        """
+        return [*self._damage, *self._told]
+
+    @property
+    def _damage(self) -> list[Loss]:
         assert self._survey is not None
         what = Counter(self._unreadable.values())
         unreadable = [Loss(0, 0, f"{count} × {text}") for text, count in what.items()]
         return [*sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
+
+    @property
+    def drops(self) -> list[str]:
+        """What the recorder itself has lost, by topic; the first look at it reads all of the file."""
+        return [
+            f"not recorded: {topic.dropped} samples of {name!r}, which the recorder had to drop"
+            for name, topic in self.topics.items()
+            if topic.dropped
+        ]
 
     @property
     def flaws(self) -> list[str]:
@@ -126,10 +149,8 @@ class Recording:
 
         That is all that cannot be read, what the recorder itself has lost, and samples out of the order of time.
         """
-        told = [f"not readable: {loss}" for loss in self.losses]
+        told = [*(f"not readable: {loss}" for loss in self._damage), *map(str, self._told), *self.drops]
         for name, topic in self.topics.items():
-            if topic.dropped:
-                told.append(f"not recorded: {topic.dropped} samples of {name!r}, which the recorder had to drop")
             if topic.unsorted:
                 told.append(f"out of order: {topic.unsorted} samples of {name!r} are older than their predecessor")
         return told
@@ -233,6 +254,16 @@ def open_scan(file: Path) -> McapScan:
         raise ConfigError(
             f"the recording cannot be read: {error.strerror}", file=str(file), remedy="check the path"
         ) from error
+
+
+def _told_losses(scan: McapScan) -> Iterator[Loss]:
+    """What the file's metadata tell of losses."""
+    for record in scan.metadata:
+        if record.name == REPAIR_RECORD and (losses := record.metadata.get("losses")):
+            yield from (Loss(0, 0, f"lost before the repair: {loss}") for loss in losses.split(LIST_MARK))
+        elif record.name == FAILURE_RECORD:
+            reason = record.metadata.get("reason", "unknown")
+            yield Loss(0, 0, f"the recording was stopped because it could not be written: {reason}")
 
 
 def _is_wanted(topic: str, topics: Collection[str] | None) -> bool:

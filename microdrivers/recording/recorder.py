@@ -166,8 +166,10 @@ class Recorder:
         self._write_waiting()
         with self._write_lock:
             self._closed = True
+            stopped = self._failure if self._on_failure == "stop" else None
+            failure = None if stopped is None else stopped.strerror or str(stopped)
             try:
-                self._out.finish(read_clock(self._clock), now_ns=self._clock.now_ns())
+                self._out.finish(read_clock(self._clock), now_ns=self._clock.now_ns(), failure=failure)
             except OSError as error:
                 self._fail(error, "its end could not be written; what it holds can be read all the same")
             self._output.close()

@@ -10,12 +10,12 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from microdrivers.recording.header import HEADER_RECORD, PROFILE, to_metadata
+from microdrivers.recording.header import HEADER_RECORD, PROFILE, REPAIR_RECORD, to_metadata
 from microdrivers.recording.images import IMAGE_SCHEMA
 from microdrivers.recording.mcap_scan import Loss, McapScan, read_definition, records_in
 from microdrivers.recording.mcap_writer import MESSAGE, ChannelKey, LostChunk, McapWriter
 from microdrivers.recording.output import create_file, not_writable
-from microdrivers.recording.reader import open_scan, read_header
+from microdrivers.recording.reader import LIST_MARK, open_scan, read_header
 from microdrivers.recording.schemas import FrameInfo, schema_name
 
 
@@ -100,7 +100,9 @@ class _Copy:
         self._writer.flush()
         if self._undefined:
             self.losses.append(Loss(0, 0, f"{self._undefined} messages of channels whose definition is lost"))
-        self._writer.add_metadata("repair", {"losses": "; ".join(map(str, [*self._scan.losses, *self.losses]))})
+        self._writer.add_metadata(
+            REPAIR_RECORD, {"losses": LIST_MARK.join(map(str, [*self._scan.losses, *self.losses]))}
+        )
         self._writer.finish()
 
     def _copy_chunk(self, chunk: bytes) -> None:

@@ -13,6 +13,7 @@ from microdrivers.recording.channels import ARRIVALS_TOPIC, DROPS_TOPIC
 from microdrivers.recording.codec import Codec, codec_of
 from microdrivers.recording.header import (
     CLOCK_RECORD,
+    FAILURE_RECORD,
     HEADER_RECORD,
     PROFILE,
     ClockMapping,
@@ -201,8 +202,8 @@ class SampleFile:
         self._flush_chunk()
         self._writer.add_attachment(name, media_type, data, log_ns=max(now_ns + self._clock.offset_ns, 0))
 
-    def finish(self, end: ClockMapping, *, now_ns: int) -> None:
-        """Write the file's end.
+    def finish(self, end: ClockMapping, *, now_ns: int, failure: str | None) -> None:
+        """Write the file's end, with the `failure` that has stopped the recording, if one has.
 
         Raises:
             OSError: it could not be written; what the file holds can be read all the same.
@@ -211,4 +212,6 @@ class SampleFile:
         clock = msgspec.structs.replace(self._clock, end_offset_ns=end.offset_ns, end_uncertainty_ns=end.uncertainty_ns)
         self._writer.add_metadata(HEADER_RECORD, to_metadata(self._header))
         self._writer.add_metadata(CLOCK_RECORD, to_metadata(clock))
+        if failure is not None:
+            self._writer.add_metadata(FAILURE_RECORD, {"reason": failure})
         self._writer.finish()

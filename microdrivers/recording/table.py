@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,12 @@ from typing import NamedTuple
 from microdrivers.core.errors import ConfigError
 
 _LARGEST_NUMBER = 1e9
+_LATEST_S = 1e10
+"""Of `time_s`: seconds of an epoch are fine, its milliseconds are none."""
+
+
+_OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 
 class TableRow(NamedTuple):
@@ -31,7 +38,8 @@ class Table:
 
     Raises:
         ConfigError: with file, line and column: a missing column, a value that is not a finite number, times that do
-            not increase, an incomplete row, no rows at all, not a table.
+            not increase, a row with too few or too many cells, a column that is there twice, another separator, no
+            rows at all, not a table.
     """
 
     def __init__(
@@ -83,7 +91,21 @@ class Table:
         return rows
 
     def _take_header(self, line: int, header: list[str]) -> None:
+        separator = next((name for sign, name in _OTHER_SEPARATORS.items() if sign in "".join(header)), None)
         missing = [column for column in self._columns if column not in header]
+        if missing and separator is not None:
+            raise ConfigError(
+                f"the cells are separated by {separator}, not by commas",
+                file=str(self.file), line=line, column=1,
+                remedy="save the table with commas between the cells, and points in the numbers (0.5)",
+            )  # fmt: skip
+        twice = [column for column in self._columns if header.count(column) > 1]
+        if twice:
+            raise ConfigError(
+                f"column {', '.join(twice)} is there more than once",
+                file=str(self.file), line=line, column=len(header) - header[::-1].index(twice[0]),
+                remedy="keep one column of each name",
+            )  # fmt: skip
         if missing:
             raise ConfigError(
                 f"column {', '.join(missing)} is missing (found: {', '.join(header)})",
@@ -96,6 +118,12 @@ class Table:
             raise ConfigError(
                 f"the row has {len(cells)} cells, the header {len(self.header)}",
                 file=str(self.file), line=line, column=len(cells), remedy="complete the row",
+            )  # fmt: skip
+        if any(cell.strip() for cell in cells[len(self.header) :]):
+            raise ConfigError(
+                f"the row has {len(cells)} cells, the header {len(self.header)}",
+                file=str(self.file), line=line, column=len(self.header) + 1,
+                remedy="write numbers with a decimal point (0.5, not 0,5), and a name above each column",
             )  # fmt: skip
         row = TableRow(line, dict(zip(self.header, cells, strict=False)), {})
         for key in self._numeric:
@@ -110,7 +138,16 @@ class Table:
             number = math.inf
         if math.isnan(number) and key in self._may_be_nan:
             return number
-        if not abs(number) < _LARGEST_NUMBER or (key in self._positive and number <= 0):
+        if _DECIMAL_COMMA.fullmatch(text):
+            raise self.error(
+                row, key, f"{text!r} has a decimal comma", remedy="write numbers with a decimal point: 0.5, not 0,5"
+            )
+        largest = _LATEST_S if key == "time_s" else _LARGEST_NUMBER
+        if largest <= abs(number) < math.inf:
+            raise self.error(
+                row, key, f"{text} is beyond {largest:g}", remedy="check the unit, which the column's name states"
+            )
+        if not abs(number) < largest or (key in self._positive and number <= 0):
             above = " above zero" if key in self._positive else ""
             raise self.error(
                 row, key, f"{row.cells[key]!r} is not a finite number{above}",

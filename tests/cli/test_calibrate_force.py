@@ -28,6 +28,17 @@ def test_nothing_is_opened_if_the_operator_says_no(run, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("value", ["nan", "inf", "-1"])
+@pytest.mark.parametrize("option", ["--hold-s", "--depth-um", "--speed-um-s", "--max-force-uN"])
+def test_a_figure_that_cannot_be_is_refused_before_anything_opens(run, tmp_path, option, value):
+    result = run("calibrate", "force", "--rig", tmp_path / "no.yaml", option, value, "--out", tmp_path / "out")
+    assert result.exit_code in (1, 2)
+    assert "Is the specimen held" not in result.stderr
+    assert "no.yaml" not in result.stderr
+    assert value in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=600, error=MoveCancelled("the force guard has stopped it"))
     with pytest.raises(MoveCancelled):

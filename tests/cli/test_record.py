@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import h5py
 import pytest
 import yaml
 
@@ -51,6 +52,33 @@ def test_record_takes_the_topics_that_are_named(run, tmp_path):
     assert set(Recording(tmp_path / "a.mcap").topics) == {"probe_force", "sample_stage", "sample_stage/event"}
 
 
+def test_names_that_meet_no_topic_are_told(run, tmp_path):
+    rig = shipped_rig("workstation")
+    result = run("record", rig, "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "prob_force,nothing*")
+    assert result.exit_code == 1
+    assert "there is no topic 'prob_force', 'nothing*'" in result.stderr
+    assert "did you mean 'probe_force'?" in result.stderr
+    assert "sample_stage/event" in result.stderr
+    assert not (tmp_path / "a.mcap").exists()
+    result = run("record", rig, "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "probe_force,zooom")
+    assert result.exit_code == 1
+    assert "there was no topic 'zooom': did you mean 'zoom'?" in result.stderr
+    assert set(Recording(tmp_path / "a.mcap").topics) == {"probe_force"}
+
+
+@pytest.mark.parametrize("names", ["", ",,"])
+def test_topics_that_name_nothing_are_refused(run, tmp_path, names):
+    result = run("record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", names)
+    assert (result.exit_code, "--topics names no topic" in result.stderr) == (1, True)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("duration_s", ["nan", "inf"])
+def test_a_recording_lasts_a_finite_time(run, duration_s):
+    result = run("record", shipped_rig("microscope"), "--fake", "--for", duration_s)
+    assert (result.exit_code, "is no time" in result.stderr or "range" in result.stderr) == (2, True)
+
+
 def test_record_needs_an_end_where_time_flies_and_a_file_that_is_new(run, tmp_path):
     result = run("record", shipped_rig("microscope"), "--fake")
     assert result.exit_code == 1
@@ -70,7 +98,18 @@ def test_repair_tells_what_was_kept_and_lost(run, tmp_path):
     assert result.exit_code == 0, result.output
     assert "the recording was not ended" in result.stdout
     assert f"of {len(whole) // 2} bytes" in result.stdout
-    assert Recording(tmp_path / "a.repaired.mcap").losses == []
+    repaired = Recording(tmp_path / "a.repaired.mcap")
+    told = [str(loss) for loss in repaired.losses]
+    assert all(loss.startswith("lost before the repair: ") for loss in told)
+    assert any("the recording was not ended" in loss for loss in told)
+    assert not repaired.complete
+    shown = run("info", "a.repaired.mcap").stdout
+    assert "complete" not in shown.splitlines()[0]
+    assert f"  lost       {told[-1]}" in shown
+    run("export", "a.repaired.mcap", "--to", "hdf5")
+    [hdf5] = tmp_path.glob("*-export/*.h5")
+    with h5py.File(hdf5) as exported:
+        assert exported.attrs["losses"] == "; ".join(told)
     assert run("recording", "repair", "a.mcap").exit_code == 1
     result = run("recording", "repair", "a.repaired.mcap", "--out", "b.mcap")
     assert "nothing was lost" in result.stdout

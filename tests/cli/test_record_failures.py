@@ -3,6 +3,8 @@
 import contextlib
 import json
 import resource
+import subprocess
+import sys
 
 import pytest
 
@@ -30,9 +32,14 @@ def test_record_on_a_full_disk(run, tmp_path, on_failure):
     assert result.exit_code == 1
     recording = Recording(tmp_path / "a.mcap")
     cameras = recording.topics["camera_fine"]
-    assert recording.losses == []
     assert recording.complete
     assert 0 < cameras.count < 6
+    stopped = ["the recording was stopped because it could not be written: File too large"]
+    assert [str(loss) for loss in recording.losses] == (stopped if on_failure == "stop" else [])
+    shown = run("info", "a.mcap").stdout
+    assert "NOT COMPLETE" in shown.splitlines()[0]
+    assert f"lost       not recorded: {cameras.dropped} samples of 'camera_fine'" in shown
+    assert "nothing" not in shown.splitlines()[-1]
     if on_failure == "stop":
         assert "could not be written: File too large" in result.stderr
         assert "--on-failure go-on" in result.stderr
@@ -89,3 +96,54 @@ def test_images_may_be_compressed(run, tmp_path):
     assert run("calibrate", "optics", "--replay", file, "--out", "again").exit_code == 0
     one, other = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("run", "again"))
     assert (one["projection"], one["covariance"]) == (other["projection"], other["covariance"])
+
+
+@pytest.mark.parametrize("size", [40_000, 400_000])
+@pytest.mark.parametrize("form", ["csv", "hdf5", "images", "video"])
+def test_exports_to_a_full_disk_fail_and_leave_nothing(run, optics_recording, tmp_path, form, size):
+    with Recording(optics_recording) as recording:
+        assert recording.topics["camera"].count == 30
+    arguments = ("export", optics_recording, "--to", form, "--out", "out")
+    if form in ("csv", "images"):
+        size = 1000
+    with disk_with(size):
+        result = run(*arguments)
+    assert result.exit_code == 1
+    assert "written" in result.stderr
+    assert "on a disk with space left" in result.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+    result = run(*arguments)
+    assert result.exit_code == 0, result.stderr
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_recording_that_somebody_removes_is_told(run, tmp_path, prepared, replaced):
+    file = tmp_path / "a.mcap"
+
+    def remove():
+        file.unlink()
+        if replaced:
+            file.write_text("another")
+
+    prepared(lambda rig: rig.clock.call_at(rig.clock.now_ns() + 50_000_000, remove, name="somebody"))
+    result = run("record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "zoom")
+    assert (result.exit_code, "gone: while it was written" in result.stdout) == (1, True), result.output
+
+
+def test_a_contact_sheet_is_whole_or_not_there(run, optics_recording, tmp_path):
+    with disk_with(4096):
+        result = run("info", optics_recording, "--contact-sheet", "sheet.png")
+    assert (result.exit_code, "cannot be written: File too large" in result.stderr) == (1, True)
+    assert not (tmp_path / "sheet.png").exists()
+
+
+def test_hdf5_on_a_full_disk_ends_with_its_program(optics_recording, tmp_path):
+    """What HDF5 could not write it tries again when the process ends."""
+    command = [sys.executable, "-m", "microdrivers", "export", optics_recording, "--to", "hdf5", "--out", tmp_path]
+    with disk_with(40_000):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert [line for line in done.stderr.splitlines() if not line.startswith("·")] == [
+        f"error: {tmp_path}: nothing can be written there: File too large",
+        "  to do: choose another --out folder, on a disk with space left",
+    ]

@@ -1,6 +1,7 @@
 """replay, info, export, analyse: what they show, and what they refuse."""
 
 import json
+import os
 import random
 import shutil
 
@@ -12,6 +13,7 @@ from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.samples import ForceSample
 from microdrivers.recording.errors import RecordingError
 from microdrivers.recording.header import RecordingHeader
+from microdrivers.recording.mcap_scan import McapScan
 from microdrivers.recording.playback import RecordingPlayback
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.recorder import Recorder
@@ -48,11 +50,10 @@ def test_files_that_are_no_recordings(run, tmp_path, command):
         result = run(command[0], f"{name}.mcap", *command[1:])
         assert told in result.stderr
         assert "Traceback" not in result.stderr
+        assert result.exit_code == 1
         if command[0] == "analyse":
             assert "1 with errors" in result.stdout
             (tmp_path / "t.csv").unlink()
-        else:
-            assert result.exit_code == 1
     assert run(command[0], "none.mcap", *command[1:]).exit_code == 1
 
 
@@ -119,6 +120,40 @@ def test_times_out_of_order_and_dropped_samples_are_told_to_who_uses_them(run, o
     run("analyse", "a.mcap", "--out", "t.csv")
     [row] = read_table(tmp_path / "t.csv")
     assert (row["losses"], row["dropped"], row["unsorted"]) == ("0", "2", "1")
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "value"),
+    [
+        *(("optics", "--replay", given) for given in (
+            ("--zoom-to", "1.2"), ("--zoom-from", "0.9"), ("--frames", "100"), ("--settled",), ("--seed", "0"),
+            ("--record",), ("--compress-images",), ("--radius-um", "100"), ("--rig", "lab.yaml"), ("--fake",),
+        )),
+        *(("optics", "--images", given) for given in (("--seed", "1"), ("--in-motion",))),
+        *(("force", "--replay", given) for given in (
+            ("--depth-um", "60"), ("--max-force-uN", "9"), ("--hold-s", "1"), ("--specimen", "a"), ("--no-record",),
+            ("--world", "a.yaml"),
+        )),
+        *(("force", "--csv", given) for given in (("--speed-um-s", "5"), ("--seed", "0"), ("--no-check",))),
+    ],
+)  # fmt: skip
+def test_options_that_drive_an_experiment_are_refused_where_there_is_none(run, tmp_path, kind, option, value):
+    result = run("calibrate", kind, option, "data", *value, "--out", "run")
+    assert result.exit_code == 1
+    assert f"{option} replaces the rig" in result.stderr
+    assert "leave out --" in result.stderr
+    assert value[0].replace("no-", "").replace("--in-motion", "--settled") in result.stderr.splitlines()[-1]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_replay_never_writes_over_a_result(run, run_file, force_recording, tmp_path):
+    for kind, source in (("optics", run_file), ("force", force_recording)):
+        folder = tmp_path / kind
+        folder.mkdir()
+        (folder / "result.json").write_text("mine")
+        result = run("calibrate", kind, "--replay", source, "--out", folder)
+        assert (result.exit_code, "a result is never written over" in result.stderr) == (1, True)
+        assert [(file.name, file.read_text()) for file in folder.iterdir()] == [("result.json", "mine")]
 
 
 def copy_without(source, file, topic):
@@ -217,3 +252,95 @@ def test_analyse(run, run_file, tmp_path):
     assert result.exit_code == 0, result.output
     assert "1 recordings, 0 with errors" in result.stdout
     assert "never written over" in run("analyse", ".", "--out", "t.csv").stderr
+
+
+def rewrite(source, file, change=lambda sample: [sample]):
+    """A copy in chunks of few samples, each sample replaced by what `change` makes of it."""
+    bus, clock = Bus(), SimulatedClock()
+    with (
+        Recording(source) as whole,
+        Recorder(file, bus=bus, clock=clock, header=RecordingHeader(source="recorded")),
+    ):
+        for topic, sample in whole.samples():
+            for changed in change(sample):
+                bus.topic(topic, type(changed)).publish(changed)
+            clock.sleep(0.05)
+
+
+def damage_a_chunk(file, share):
+    with Recording(file) as whole:
+        place = whole._scan.chunks[round(share * len(whole._scan.chunks))]
+    data = bytearray(file.read_bytes())
+    data[place.offset + place.length - 1] ^= 1
+    file.write_bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["optics", "force"])
+def test_a_result_from_a_damaged_recording_says_so(run, optics_recording, force_recording, tmp_path, kind):
+    rewrite({"optics": optics_recording, "force": force_recording}[kind], tmp_path / "run.mcap")
+    damage_a_chunk(tmp_path / "run.mcap", 0.8)
+    result = run("calibrate", kind, "--replay", "run.mcap", "--out", "again")
+    assert result.exit_code == 0, result.stderr
+    told = "with a flaw: not readable: a chunk is damaged: its CRC does not match"
+    assert any(told in note for note in json.loads((tmp_path / "again" / "result.json").read_text())["notes"])
+    assert told in (tmp_path / "again" / "report.html").read_text()
+    assert "NOT COMPLETE" in run("info", "run.mcap").stdout.splitlines()[0]
+    run("recording", "repair", "run.mcap")
+    assert run("calibrate", kind, "--replay", "run.repaired.mcap", "--out", "repaired").exit_code == 0
+    assert "lost before the repair: a chunk is damaged" in (tmp_path / "repaired" / "result.json").read_text()
+    run("analyse", "run.repaired.mcap", "--out", "t.csv")
+    [row] = read_table(tmp_path / "t.csv")
+    assert row["losses"] == "1"
+
+
+def test_an_interrupted_characterisation_stays_one_when_it_is_replayed(run, force_recording, tmp_path):
+    def is_end(sample):
+        return getattr(sample, "kind", "") == "force/end"
+
+    def interrupted(sample):
+        if not is_end(sample):
+            return [sample]
+        content = json.dumps({"ended_by": "it was interrupted"})
+        return [sample, msgspec.structs.replace(sample, kind="force/done", content=content, order=sample.order + 1)]
+
+    rewrite(force_recording, tmp_path / "broken_off.mcap", lambda sample: [] if is_end(sample) else [sample])
+    rewrite(force_recording, tmp_path / "interrupted.mcap", interrupted)
+    rewrite(force_recording, tmp_path / "whole.mcap")
+    cut = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(cut[: int(0.7 * len(cut))])
+    for name, told in (
+        ("broken_off", ["the recorded run ends before indentation 1 was over"]),
+        ("cut", ["the recording was cut off, and ends before indentation 1 was over"]),
+        ("interrupted", ["it was interrupted"]),
+        ("whole", []),
+    ):
+        result = run("calibrate", "force", "--replay", f"{name}.mcap", "--out", name)
+        assert result.exit_code == 0, result.stderr
+        found = json.loads((tmp_path / name / "result.json").read_text())
+        assert found["complete"] is (not told)
+        ended = [entry for entry in found["notes"] if "ended early" in entry]
+        assert len(ended) == len(told)
+        assert all(f"The run ended early: {why}." in entry for entry, why in zip(ended, told, strict=True))
+
+
+def test_analyse_succeeds_if_some_can_be_analysed(run, run_file, tmp_path):
+    (tmp_path / "bad.mcap").write_bytes(b"")
+    result = run("analyse", ".", "--out", "t.csv")
+    assert (result.exit_code, "2 recordings, 1 with errors" in result.stdout) == (0, True)
+
+
+def test_analyse_waits_for_no_pipe(run, run_file, tmp_path):
+    os.mkfifo(tmp_path / "pipe.mcap")
+    assert "1 recordings, 0 with errors" in run("analyse", ".", "--out", "t.csv").stdout
+    result = run("analyse", "pipe.mcap", "--out", "u.csv")
+    assert (result.exit_code, "neither a file nor a folder" in result.stderr) == (1, True)
+
+
+def test_an_interrupted_repair_leaves_no_half_copy(run, run_file, tmp_path, monkeypatch):
+    def interrupt(self, place):
+        assert (tmp_path / "new.mcap").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(McapScan, "read_chunk", interrupt)
+    result = run("recording", "repair", run_file, "--out", "new.mcap")
+    assert (result.exit_code, (tmp_path / "new.mcap").exists()) == (130, False)

@@ -6,6 +6,7 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -57,6 +58,22 @@ def test_real_micrographs_calibrate_to_their_stated_projection(tmp_path):
     assert result["zoom_change"] is None
     page = re.sub(r"<(style|svg).*?</\1>|<[^>]*>", " ", (tmp_path / "out" / "report.html").read_text(), flags=re.DOTALL)
     assert not re.search(r"\b(nan|none|inf)\b", page.lower())
+
+
+def test_a_zoom_at_which_nothing_was_found_is_told(tmp_path):
+    folder = shutil.copytree(MICROGRAPHS, tmp_path / "sequence")
+    result = calibrate(folder, tmp_path / "one")
+    assert "The zoom changed" not in result.stdout
+    rows = ImageSequence(folder).rows
+    blank = np.zeros_like(ImageSequence(folder).load(rows[0]))
+    for row in rows[20:]:
+        edit_cell(folder, row.line, "zoom", "1.5")
+        cv2.imwrite(str(row.file), blank)
+    result = calibrate(folder, tmp_path / "two")
+    assert result.exit_code == 0, result.output
+    notes = json.loads((tmp_path / "two" / "result.json").read_text())["notes"]
+    [told] = [note for note in notes if "The zoom changed" in note]
+    assert "The zoom changed to 1.5, where no frame could be used: this is the calibration at zoom 1." in told
 
 
 def test_comments_and_further_columns_are_allowed(sequence):

@@ -42,10 +42,10 @@ def test_each_row_is_a_force_and_a_deformation_of_one_time(tmp_path):
 
 
 @pytest.mark.parametrize("cell", ["", "nan"])
-def test_a_missing_force_is_a_reading_without_a_sensor(tmp_path, cell):
+def test_a_missing_force_was_not_measured(tmp_path, cell):
     forces, _ = published(table(tmp_path, ROWS.format(cell)))
     assert math.isnan(forces[-1].force_uN)
-    assert forces[-1].flags == {"DISCONNECTED"}
+    assert forces[-1].flags == {"NOT_MEASURED"}
 
 
 @pytest.mark.parametrize(
@@ -56,12 +56,26 @@ def test_a_missing_force_is_a_reading_without_a_sensor(tmp_path, cell):
         (("0.033333", "0.0"), r"indentation\.csv:4:1: time_s: time does not increase"),
         (("0.033333", "nan"), r"indentation\.csv:4:1: time_s: 'nan' is not a finite number"),
         (("0.6,1.25,loading", "0.6"), r"indentation\.csv:4:2: the row has 2 cells, the header 4"),
+        (("segment", "force_uN"), r"indentation\.csv:2:4: column force_uN is there more than once"),
+        ((",", ";"), r"indentation\.csv:2:1: the cells are separated by semicolons"),
+        ((",", "\t"), r"indentation\.csv:2:1: the cells are separated by tabs"),
+        (("0.6,1.25,loading", "0,6,1.25,loading"), r"indentation\.csv:4:5: the row has 5 cells.*\n.*decimal point"),
+        (("0.6,1.25", '"0,6",1.25'), r"indentation\.csv:4:2: indentation_um: '0,6' has a decimal comma"),
+        (("0.033333", "1732286792000"), r"indentation\.csv:4:1: time_s: 1732286792000 is beyond 1e\+10"),
         ((ROWS, "# nothing\ntime_s,indentation_um,force_uN\n"), "the table has no rows"),
     ],
 )
 def test_a_mistake_has_its_line_and_column(tmp_path, change, message):
     with pytest.raises(ConfigError, match=message):
         IndentationTable(table(tmp_path, ROWS.replace(*change).replace("{}", "1.5")))
+
+
+def test_time_may_count_from_an_epoch(tmp_path):
+    text = ROWS.format("1.5")
+    for seconds in ("0.0,", "0.033333,", "0.066667,"):
+        text = text.replace(f"\n{seconds}", f"\n{1732286792.0 + float(seconds[:-1]):.6f},")
+    forces, _ = published(table(tmp_path, text))
+    assert forces[2].t_ns - forces[0].t_ns == pytest.approx(66_667_000, abs=1000)
 
 
 def test_a_missing_file_is_named(tmp_path):

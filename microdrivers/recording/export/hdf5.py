@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,67 @@ _CHUNK_BYTES = 256 * 1024
 _FRAMES = 8
 
 
+class _Output(io.RawIOBase):
+    """The file as HDF5 sees it, one that takes everything.
+
+    A file that HDF5 could not write to its end takes the process with it: so it is not told. What the disk refuses,
+    and whatever follows, is dropped, and `check` tells.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._raw = file.open("x+b", buffering=0)
+        self._error: OSError | None = None
+        self._at = 0
+        self._size = 0
+
+    def check(self) -> None:
+        """Raises: OSError: something could not be written."""
+        if self._error is not None:
+            raise self._error
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        self._raw.seek(self._at)
+        got = 0
+        while got < len(buffer) and (more := self._raw.readinto(buffer[got:])):
+            got += more
+        buffer[got:] = bytes(len(buffer) - got)
+        self._at += len(buffer)
+        return len(buffer)
+
+    def write(self, data: Any) -> int:
+        done = 0
+        try:
+            self._raw.seek(self._at)
+            while self._error is None and done < len(data):
+                done += self._raw.write(data[done:])
+        except OSError as error:
+            self._error = error
+        self._at += len(data)
+        self._size = max(self._size, self._at)
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._at if size is None else size
+        self._size = size
+        try:
+            if self._error is None:
+                self._raw.truncate(size)
+        except OSError as error:
+            self._error = error
+        return size
+
+    def close(self) -> None:
+        super().close()
+        self._raw.close()
+
+
 class Hdf5File:
     """One group a topic, in it one dataset a field; all first dimensions are samples. MATLAB sees them transposed.
 
@@ -34,7 +97,8 @@ class Hdf5File:
 
     def __init__(self, file: Path, recording: Recording, *, start_ns: int) -> None:
         self._h5py = optional_module("h5py")
-        self._file = self._h5py.File(str(file), "x")
+        self._output = _Output(file)
+        self._file = self._h5py.File(self._output, "w")
         self._start_ns = start_ns
         about = msgspec.structs.asdict(recording.header)
         if recording.clock is not None:
@@ -49,19 +113,32 @@ class Hdf5File:
         """The group of a topic, to write to; `widths` of its texts, bytes."""
         group = self._file.create_group(name)
         group.attrs.update({"topic": topic, "sample_type": sample_type.__name__, "description": describe(sample_type)})
-        return Hdf5Topic(self._h5py, group, sample_type, widths, start_ns=self._start_ns)
+        return Hdf5Topic(self._h5py, group, sample_type, widths, start_ns=self._start_ns, check=self._output.check)
 
     def close(self) -> None:
         """Complete the file."""
         self._file.close()
+        self._output.close()
 
 
 class Hdf5Topic:
-    """Writes one topic."""
+    """Writes one topic.
+
+    Attributes:
+        verify: raises OSError if something could not be written so far.
+    """
 
     def __init__(
-        self, h5py: Any, group: Any, sample_type: type[Sample], widths: Mapping[str, int], *, start_ns: int
+        self,
+        h5py: Any,
+        group: Any,
+        sample_type: type[Sample],
+        widths: Mapping[str, int],
+        *,
+        start_ns: int,
+        check: Callable[[], None],
     ) -> None:
+        self.verify = check
         self.batch = _FRAMES if sample_type is Frame else 16_384
         self._h5py = h5py
         self._group = group
@@ -91,7 +168,12 @@ class Hdf5Topic:
         made.attrs.update({key: said for key, said in about.items() if said})
 
     def write(self, samples: list[Sample]) -> None:
-        """Append samples."""
+        """Append samples.
+
+        Raises:
+            OSError: the disk has refused some.
+        """
+        self.verify()
         end = self._count + len(samples)
         for name, array in arrays_of(samples, self._type, start_ns=self._start_ns).items():
             written = self._group[name]
@@ -105,6 +187,7 @@ class Hdf5Topic:
             if isinstance(sample, Frame):
                 self._add_image(sample, self._count + offset)
         self._count = end
+        self.verify()
 
     def _add_image(self, frame: Frame, index: int) -> None:
         image = frame.image

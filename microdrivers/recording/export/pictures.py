@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,8 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import notes_of
 
 _INFO = ("t_ns", "exposure_ms", "frame_id", "seq", "dropped_before", "settings_id", "bit_depth")
+_RIFF = struct.Struct("<4sI")
+"""What an AVI file begins with: `RIFF`, and how many bytes follow."""
 
 
 class Track(NamedTuple):
@@ -105,6 +108,7 @@ class VideoFile:
         self._rate_hz = rate_hz if math.isfinite(rate_hz) and rate_hz > 0 else 30.0
         self._shape: tuple[int, ...] = ()
         self._writer: Any = None
+        self._written = 0
 
     def write(self, samples: list[Sample]) -> None:
         """Append frames."""
@@ -117,6 +121,7 @@ class VideoFile:
                 self._open(image.shape)
             if image.shape == self._shape:
                 self._writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+                self._written += 1
             else:
                 self.left_out += 1
 
@@ -137,6 +142,34 @@ class VideoFile:
         """Complete the file."""
         if self._writer is not None:
             self._writer.release()
+
+    def verify(self) -> None:
+        """Look whether the closed file holds every frame: OpenCV's writer tells no failure.
+
+        Raises:
+            MicrodriversError: it does not.
+        """
+        if self._written and not (self._has_its_size() and self._shows_its_frames()):
+            raise MicrodriversError(
+                f"the video {self._file.name} could not be written to its end",
+                remedy="choose another --out folder, on a disk with space left",
+            )
+
+    def _has_its_size(self) -> bool:
+        with self._file.open("rb") as stream:
+            head = stream.read(_RIFF.size)
+        return len(head) == _RIFF.size and _RIFF.unpack(head)[1] + _RIFF.size == self._file.stat().st_size
+
+    def _shows_its_frames(self) -> bool:
+        import cv2
+
+        capture = cv2.VideoCapture(str(self._file), cv2.CAP_OPENCV_MJPEG)
+        try:
+            found = sum(capture.grab() for _ in range(self._written))
+            last_is_whole = capture.retrieve()[0]
+            return found == self._written and last_is_whole and not capture.grab()
+        finally:
+            capture.release()
 
 
 def eight_bit(frame: Frame) -> npt.NDArray[np.uint8]:

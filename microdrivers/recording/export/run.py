@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Protocol, get_args
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import Frame, Sample
 from microdrivers.recording.channels import literal
-from microdrivers.recording.export.hdf5 import Hdf5File, text_widths
+from microdrivers.recording.export.hdf5 import Hdf5File, Hdf5Topic, text_widths
 from microdrivers.recording.export.pictures import ImageFolder, VideoFile, track_of
 from microdrivers.recording.export.tables import CsvTopic, ParquetTopic
 from microdrivers.recording.export.target import file_names, staged
@@ -104,6 +104,9 @@ def export_recording(
                 if batch:
                     writers[topic].write(batch)
             on_progress(done, total)
+        for writer in writers.values():
+            if isinstance(writer, (Hdf5Topic, VideoFile)):
+                writer.verify()
     remarks = [
         f"{topic}: {writer.left_out} frames of another size than the first one were left out"
         for topic, writer in writers.items()

@@ -39,13 +39,15 @@ def find_recordings(runs: Sequence[Path]) -> list[str]:
     """The recordings that are meant: files as they are, of folders all `*.mcap` in and below; sorted, each once.
 
     Raises:
-        ConfigError: there is no such file or folder, or a folder holds no recording.
+        ConfigError: there is no such file or folder, or a folder holds no recording, or what is named is neither.
     """
     found: set[str] = set()
     for run in runs:
         if not run.exists():
             raise ConfigError("there is no such recording", file=str(run), remedy="check the path")
-        inside = [str(file) for file in run.rglob("*.mcap")] if run.is_dir() else [str(run)]
+        if not (run.is_file() or run.is_dir()):  # a pipe lets its reader wait
+            raise ConfigError("it is neither a file nor a folder", file=str(run), remedy="name recordings")
+        inside = [str(file) for file in run.rglob("*.mcap") if file.is_file()] if run.is_dir() else [str(run)]
         if not inside:
             raise ConfigError("the folder holds no *.mcap", file=str(run), remedy="name recordings or their folders")
         found.update(inside)

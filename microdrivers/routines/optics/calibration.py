@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.inbox import EstimatorHost, Inbox
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
 from microdrivers.core.units import NS_PER_S
@@ -22,8 +23,10 @@ from microdrivers.results.optics import (
     iterations_to_settle,
 )
 from microdrivers.results.record import Provenance, Trace
+from microdrivers.routines.notes import note
 from microdrivers.routines.optics.choice import Choice, begins_change, choose_estimate
-from microdrivers.routines.optics.source import HOST, Optics, OpticsSource
+from microdrivers.routines.optics.source import DONE, HOST, Optics, OpticsSource
+from microdrivers.routines.past_run import INTERRUPTED, PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
 
@@ -35,6 +38,8 @@ class OpticsRun(NamedTuple):
         estimates: one a matched frame.
         arrivals: bus-wide order numbers in the order in which the estimator saw the samples.
         recorded: those samples, if asked for.
+        past_run: what a recording tells of its run.
+        last_zoom: the newest reading, which no frame need have been used with; None without any.
     """
 
     complete: bool
@@ -45,6 +50,8 @@ class OpticsRun(NamedTuple):
     optics: Optics
     arrivals: list[int]
     recorded: list[Sample]
+    past_run: PastRun
+    last_zoom: float | None = None
 
 
 def calibrate_optics(
@@ -96,17 +103,24 @@ def calibrate_optics(
         )
         on_host(HOST, hosts[-1].inbox)
 
-    complete = True
+    ended_by = "an error of the program"
     try:
         source.run(begin, progress or SilentProgress())
     except KeyboardInterrupt:
-        complete = False
+        ended_by = INTERRUPTED
+    except MicrodriversError as error:
+        ended_by = error.what
+        raise
+    else:
+        ended_by = ""
     finally:
         for host in hosts:
             host.close()
         subscription.cancel()
+        note(bus, source.clock, DONE, {"ended_by": ended_by})
+    last_zoom = bus.topic(names.zoom, ZoomSample).latest
     return OpticsRun(
-        complete=complete,
+        complete=not ended_by,
         estimates=estimates,
         lost_frames=sum(calibrator.lost_frames for calibrator in calibrators),
         unmatched_frames=sum(calibrator.unmatched_frames for calibrator in calibrators),
@@ -114,6 +128,8 @@ def calibrate_optics(
         optics=source.optics(),
         arrivals=[order for host in hosts for order in host.inbox.arrivals],
         recorded=[sample for host in hosts for sample in host.recorded],
+        past_run=source.past_run,
+        last_zoom=None if last_zoom is None else last_zoom.zoom,
     )
 
 
@@ -135,7 +151,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
     pitch_um = run.optics.pixel_pitch_um
     scales = _trace([e.scale_px_per_um for e in run.estimates])
     return OpticsResult(
-        complete=run.complete and not outdated,
+        complete=run.complete and not run.past_run.ended_by and not outdated,
         projection=(p[:3], p[3:]),
         scale_px_per_um=parameters.scale_px_per_um,
         scale_sigma_px_per_um=parameters.sigma_scale_px_per_um or 0.0,
@@ -229,8 +245,20 @@ def _notes(run: OpticsRun, choice: Choice) -> list[str]:
             f"({choice.why_not_newer}): this is the calibration at zoom {choice.estimate.zoom:.4g}, and the zoom "
             f"now reads {run.estimates[-1].zoom:.4g}."
         )
+    seen = run.estimates[-1].zoom
+    if run.last_zoom is not None and abs(run.last_zoom - seen) > run.settings.zoom_still * abs(seen):
+        notes.append(
+            f"The zoom changed to {run.last_zoom:.4g}, where no frame could be used: this is the calibration at zoom "
+            f"{choice.estimate.zoom:.4g}. Texture is not found again once the zoom has changed."
+        )
     if not run.complete:
         notes.append("The run was interrupted; the result holds what had been measured until then.")
+    elif run.past_run.ended_by:
+        notes.append(
+            f"The recorded run ended early: {run.past_run.ended_by}. "
+            "The result holds what had been measured until then."
+        )
+    notes += run.past_run.notes()
     if run.lost_frames:
         notes.append(f"The target was not found in {run.lost_frames} frames.")
     if run.unmatched_frames:

@@ -35,6 +35,7 @@ from microdrivers.routines.optics.circle_drive import (
 )
 from microdrivers.routines.optics.source import BEGIN, Optics, SourceNames
 from microdrivers.routines.optics.targets import make_tracker
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 Array = npt.NDArray[np.float64]
@@ -93,6 +94,8 @@ class CircleSettings(NamedTuple):
 class CircleExperiment:
     """Finds the target, centres it, streams the stage along a circle and changes the zoom on the way."""
 
+    past_run = PastRun()
+
     def __init__(self, rig: Rig, settings: CircleSettings | None = None) -> None:
         section = rig.file.microscope
         if section is None:
@@ -123,7 +126,9 @@ class CircleExperiment:
         asked = self.settings
         if asked.radius_um is not None:
             what = "radius of the circle"
-            check_range(asked.radius_um, Range(_SMALLEST_RADIUS_UM, _LARGEST_RADIUS_UM), what=what, unit="µm")
+            check_range(
+                asked.radius_um, Range(_SMALLEST_RADIUS_UM, _LARGEST_RADIUS_UM), what=what, unit="µm", in_file=""
+            )
         needed = asked.change_after_frame + 1 + _FRAMES_TO_SETTLE
         if asked.zoom_to != asked.zoom_from and asked.frames < needed:
             raise OutOfRange(

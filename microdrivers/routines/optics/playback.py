@@ -10,11 +10,14 @@ from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.recording.image_sequence import ImageSequence
 from microdrivers.routines.optics.source import Optics, SourceNames
 from microdrivers.routines.optics.targets import TargetKind, make_tracker
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 
 class SequencePlayback:
     """Publishes an image sequence; its target is natural texture unless stated otherwise."""
+
+    past_run = PastRun()
 
     def __init__(self, sequence: ImageSequence, *, target: TargetKind = "texture") -> None:
         self.bus = Bus()

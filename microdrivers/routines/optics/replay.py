@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
@@ -11,8 +11,9 @@ from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
-from microdrivers.routines.optics.source import BEGIN, HOST, Optics, SourceNames
+from microdrivers.routines.optics.source import BEGIN, DONE, HOST, Optics, SourceNames
 from microdrivers.routines.optics.targets import make_tracker
+from microdrivers.routines.past_run import PastRun, past_run
 from microdrivers.routines.progress import Progress
 
 
@@ -27,7 +28,10 @@ class OpticsReplay:
         self.bus = Bus()
         self.clock: Clock = SimulatedClock()
         self._recording = recording
-        self._beginning = _beginning(recording)
+        notes = notes_of(recording)
+        self._beginning = _beginning(recording, notes)
+        self._done = [note for note in notes if note.kind == DONE and note.order > self._beginning.order]
+        self._missing = 0
         self.names = SourceNames(**self._beginning.content["names"])
         self._frames: list[Frame] = []
 
@@ -50,9 +54,16 @@ class OpticsReplay:
         self._frames.clear()
         begin(tracker)
         replay.as_arrived(HOST, (self.names.stage, self.names.zoom, self.names.camera), None)
+        self._missing = replay.missing
         if replay.missing:
             progress.step(f"{replay.missing} samples that the estimator had are not in the recording")
         replay.require(self.bus.topic(self.names.stage, XYThetaSample), self.bus.topic(self.names.zoom, ZoomSample))
+
+    @property
+    def past_run(self) -> PastRun:
+        """What the recording says of it."""
+        cut = "" if self._recording.complete else "the recording was cut off, and does not tell the run's end"
+        return past_run(self._recording, self._done, missing=self._missing, broken_off=cut)
 
     def _keep(self, frame: Frame) -> None:
         if frame.seq == self._beginning.content["first_frame"]:
@@ -69,11 +80,11 @@ class OpticsReplay:
         return expected
 
 
-def _beginning(recording: Recording) -> Note:
-    notes = [note for note in notes_of(recording) if note.kind == BEGIN]
-    if not notes:
+def _beginning(recording: Recording, notes: Sequence[Note]) -> Note:
+    beginnings = [note for note in notes if note.kind == BEGIN]
+    if not beginnings:
         raise UnsupportedError(
             f"{recording.file} holds no optical calibration",
             remedy="give the run.mcap of `microdrivers calibrate optics`; `microdrivers info` tells what a file holds",
         )
-    return notes[-1]
+    return beginnings[-1]

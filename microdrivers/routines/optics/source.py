@@ -8,10 +8,14 @@ from typing import NamedTuple, Protocol
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
 from microdrivers.estimators.optics.calibrator import PointTracker
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 BEGIN = "optics/begin"
 """The routine's note that what follows belongs to the calibration."""
+
+DONE = "optics/done"
+"""The routine's note that the run is over, and by what it was ended early."""
 
 HOST = "optics"
 """Under this name the order is recorded in which the estimator got its samples."""
@@ -41,6 +45,10 @@ class OpticsSource(Protocol):
     bus: Bus
     clock: Clock
     names: SourceNames
+
+    @property
+    def past_run(self) -> PastRun:
+        """What a recording tells of its run, valid after `run`."""
 
     def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
         """Publish the samples.

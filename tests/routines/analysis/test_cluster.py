@@ -16,7 +16,7 @@ def row_or_failure(file):
 
 @pytest.fixture(scope="module")
 def cluster():
-    """One worker in a thread of this process, reached over TCP. Without an address for its pages it takes a fixed port."""
+    """One worker in a thread of this process, over TCP; without an address for its pages it takes a fixed port."""
     pages = "127.0.0.1:0"
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", host="127.0.0.1", dashboard_address=pages
