@@ -12,6 +12,7 @@ from microdrivers.estimators.force.branches import Branches
 from microdrivers.estimators.force.fit_motion import motion_everywhere
 from microdrivers.estimators.force.joint import BASE, Motion, force_of, slopes_of
 from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.plausibility import doubts
 from microdrivers.estimators.force.prepared import LOADING, Indices, Prepared, SeenBefore
 from microdrivers.estimators.force.protocol_fit import (
     ProtocolFit,
@@ -20,7 +21,7 @@ from microdrivers.estimators.force.protocol_fit import (
     weak_parameters,
 )
 from microdrivers.estimators.force.protocols import Fit, ProtocolName
-from microdrivers.estimators.force.record import IndentationRecord, check
+from microdrivers.estimators.force.record import IndentationRecord, Mask, check
 from microdrivers.estimators.force.ridge import ridge_fit
 from microdrivers.estimators.force.selection import all_protocols, settled
 from microdrivers.estimators.force.structure import StructureTest, structure_test
@@ -61,7 +62,8 @@ class Slip(NamedTuple):
     Attributes:
         offset_um, rate_per_s: offset and α, each followed by its standard deviation.
         not_returned_um: deformation that was left when contact was lost; None if it was not lost.
-        identifiable: the record determines offset and α, and no other protocol explains it as well.
+        identifiable: the record determines offset and α, no other protocol explains it as well, and this one leaves
+            nothing but noise.
     """
 
     offset_um: float
@@ -152,18 +154,25 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
     left = force - fitted
     loading = prepared.branch == LOADING
     judged = loading if name == "loading" else np.ones_like(loading)
+    # `loading_only` predicts the unloading, too, but that says nothing of what it has from the loading.
+    fitted_to = loading if name in ("loading", "loading_only") else judged
     slips = name == "slip_corrected"
     solution = fit.solution
-    misfit = structure_test(
-        (solution.deformation_residual, solution.force_residual), prepared.used[fit.at], left[judged], noise[judged]
-    )
+
+    def test(mask: Mask) -> StructureTest:
+        white = (solution.deformation_residual, solution.force_residual)
+        return structure_test(white, prepared.used[fit.at], left[mask], noise[mask])
+
+    misfit, structure = test(judged), test(fitted_to)
+    ratio = _noise_ratio(left[fitted_to], noise[fitted_to])
     weak = weak_parameters(
         prepared,
         fit.theta,
         fit.covariance,
-        Motion(*(part[judged] for part in motion)),
+        Motion(*(part[fitted_to] for part in motion)),
         slips=slips,
-        structured_uN=misfit.structured_uN if misfit.found else 0.0,
+        structured_uN=structure.structured_uN if structure.found else 0.0,
+        noise_ratio=ratio if structure.found and not fit.within_noise else None,
     )
     names = ["k1", "k2", "b", "m", *(["slip", "slip_rate"] if slips else [])]
     return ProtocolFit(
@@ -172,7 +181,7 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
         covariance=parameter_covariance(fit.covariance),
         error_percent=_percent(left[judged], force[judged]),
         error_percent_loading=_percent(left[loading], force[loading]),
-        noise_residual_ratio=float(np.sqrt(np.mean(left[judged] ** 2) / np.mean(noise[judged] ** 2))),
+        noise_residual_ratio=_noise_ratio(left[judged], noise[judged]),
         condition_number=_condition(motion, fit.at),
         identifiable={key: key not in weak for key in names},
         weak=weak,
@@ -189,6 +198,10 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
 
 def _percent(left: Array, force: Array) -> float:
     return float(100.0 * np.sqrt(np.mean(left**2) / np.mean(force**2)))
+
+
+def _noise_ratio(left: Array, noise: Array) -> float:
+    return float(np.sqrt(np.mean(left**2) / np.mean(noise**2)))
 
 
 def _condition(motion: Motion, at: Indices) -> float:
@@ -239,12 +252,12 @@ def _slip(prepared: Prepared, fit: ProtocolFit | None, is_best: bool) -> Slip | 
         fit.slip_rate_per_s,
         fit.sigma_slip_rate_per_s,
         left if lost else None,
-        is_best and fit.identifiable["slip"] and fit.identifiable["slip_rate"],
+        is_best and not fit.misfit.found and fit.identifiable["slip"] and fit.identifiable["slip_rate"],
     )
 
 
 def _notes(record: IndentationRecord, prepared: Prepared) -> list[str]:
-    notes = []
+    notes = doubts(prepared)
     for what, stated, used, unit in (
         ("deformation", record.deformation_sigma_um, prepared.deformation_sigma_um, "µm"),
         ("force", record.force_sigma_uN, prepared.force_sigma_uN, "µN"),

@@ -13,7 +13,7 @@ from microdrivers.core.samples import ForceSample, Sample
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
 from microdrivers.estimators.force.scatter import ScatterOfMeans
 
-_SENSOR_FAULTS = ("DISCONNECTED", "SATURATED", "STALE")
+_SENSOR_FAULTS = ("NOT_MEASURED", "DISCONNECTED", "SATURATED", "STALE")
 _REMEMBERED = 65536
 """Frames: 36 min at 30 Hz."""
 
@@ -52,8 +52,8 @@ class IndentationMatcher:
     out of order by `lateness_s`. The stated scatter of a force is that of means over as long as the exposure.
 
     `unmatched` counts the frames that were given up, by reason: LOST (the contact point was not seen), SATURATED,
-    STALE, DISCONNECTED or INVALID (such a reading lies in the exposure, or beside it where one would have to
-    interpolate), GAP (readings too far apart), UNBRACKETED (older than all readings), OVERFLOW (too many were
+    NOT_MEASURED, STALE, DISCONNECTED or INVALID (such a reading lies in the exposure, or beside it where one would
+    have to interpolate), GAP (readings too far apart), UNBRACKETED (older than all readings), OVERFLOW (too many were
     waiting), OUT_OF_ORDER (older than a frame that has been dealt with). `given_up` holds the newest of them.
 
     Args:

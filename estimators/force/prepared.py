@@ -143,7 +143,7 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
     base, base_sigma = _baseline(time_s, force, branches, measured, sigma_f, around_reversal)
     reasons = {
         "before contact": _mask(len(time_s), branches.approach),
-        "lost contact": _mask(len(time_s), branches.lost),
+        "after the tip had left": _mask(len(time_s), branches.lost),
         "not measured": unseen,
         "saturated": full,
         **_turning(time_s, branches, around_reversal, margins),

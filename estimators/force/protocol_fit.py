@@ -52,7 +52,8 @@ class ProtocolFit:
             measured deformation and the trajectory's speed. error_percent_loading: over the loading.
         noise_residual_ratio: RMS(F − F̂) relative to what noise of force and deformation alone leaves.
         condition_number: of the scaled regressor of eq. (22) on the protocol's samples.
-        identifiable: for k1, k2, b, m (and slip, slip_rate): the record determines it.
+        identifiable: for k1, k2, b, m (and slip, slip_rate): the record determines it, and the model explains the
+            samples that it is estimated from within their noise; otherwise the number is no property of the specimen.
         weak: reasons, for those that it does not determine.
         force_uN: F̂ at every sample of the record, baseline included; without contact the baseline.
         residual_uN: RMS of the force's own residual, the noise of the deformation taken off.
@@ -143,6 +144,7 @@ def weak_parameters(
     *,
     slips: bool,
     structured_uN: float,
+    noise_ratio: float | None,
 ) -> dict[str, str]:
     """Reasons why the record does not determine a parameter, for those that it does not.
 
@@ -153,6 +155,8 @@ def weak_parameters(
         motion: of the samples that the protocol is judged by.
         slips: offset and α were estimated.
         structured_uN: RMS of what the model does not explain; a parameter may be off by as much as explains this.
+        noise_ratio: RMS residual over the noise's where the model does not explain these samples; None where it does.
+            Springs and damper then follow from which samples were fitted, and their intervals say nothing.
     """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     x, v, a = motion
@@ -164,6 +168,8 @@ def weak_parameters(
         value, half = float(theta[place]), float(INTERVAL * sigma[place])
         systematic = structured_uN / float(np.sqrt(np.mean(levers[place] ** 2))) if place in levers else 0.0
         why = []
+        if noise_ratio is not None and place in _SPRINGS_AND_DAMPER:
+            why.append(f"the model does not explain the record: {noise_ratio:.3g} × noise")
         if value <= 0.0:
             why.append(f"the estimate {value:.3g} is not positive")
         if not half <= _WIDEST * abs(value):

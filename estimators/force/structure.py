@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from microdrivers.estimators.force.model import Array
+
+FoundBy = Literal["order", "size"]
 
 LAGS = 20
 """Samples over which residuals are correlated with each other."""
@@ -33,6 +35,8 @@ class StructureTest(NamedTuple):
         structured_uN: RMS of the slow part of the force residual, noise taken off.
         noise_uN: RMS that noise alone gives a single force residual.
         found: the residual has structure, and not a negligible one: a model misfit.
+        found_by: what told: "order", Ljung and Box's test, p < `SIGNIFICANT_P`; or "size" alone, far more than noise
+            can leave, where the record is too short for its order to tell. None if nothing was found.
         text: the verdict in a sentence.
     """
 
@@ -41,6 +45,7 @@ class StructureTest(NamedTuple):
     structured_uN: float
     noise_uN: float
     found: bool
+    found_by: FoundBy | None
     text: str
 
 
@@ -67,15 +72,23 @@ def structure_test(
     significant = p_value < SIGNIFICANT_P or excess
     found = significant and structured > _MATERIAL * noise
     # A short record in disorder may look white: then it is its size that tells.
-    how = "more than noise can be" if excess else f"p = {p_value:.1g}"
+    found_by: FoundBy | None = None
+    if found:
+        found_by = "order" if p_value < SIGNIFICANT_P else "size"
+    how = f"p = {p_value:.1g}"
+    if excess:
+        times = float(np.sqrt(np.mean(left_over_uN**2))) / noise
+        how = f"{times:.3g} times what noise leaves, {how} of its order"
     figures = f"{structured:.2g} µN RMS of slow residual beside {noise:.2g} µN of noise, {how}"
     if found:
         text = f"misfit: the residual has structure that this model does not have ({figures})"
+    elif excess:
+        text = f"the residual is more than noise, but little of it is slow ({figures})"
     elif significant:
         text = f"the residual has some structure, less than the noise ({figures})"
     else:
         text = f"the residual looks like noise ({figures})"
-    return StructureTest(statistic, p_value, structured, noise, found, text)
+    return StructureTest(statistic, p_value, structured, noise, found, found_by, text)
 
 
 def _ljung_box(series: Array, place: npt.NDArray[np.int64]) -> float:

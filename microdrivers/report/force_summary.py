@@ -68,6 +68,8 @@ def _performance(result: ForceResult) -> list[str]:
     slip = slip_text(result)
     if slip and result.best == "slip_corrected":
         rows.append(("Slip", slip))
+    if any(quantity.weak for row in protocol_rows(result) for quantity in (row.k1, row.k2, row.b)):
+        rows.append(("In brackets", "not to be quoted as properties of the specimen; report.html says why"))
     rows.append(("Residual", result.misfit.text))
     check = result.vision_check
     if check is not None:

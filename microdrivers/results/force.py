@@ -35,7 +35,12 @@ class Contact(Record):
 
 
 class Identifiable(Record):
-    """Whether the record determines each parameter; `reasons` say why not."""
+    """Whether each parameter is a property of the specimen; `reasons` say why not.
+
+    It is one if the record determines it and the model leaves nothing but noise of the samples that it is estimated
+    from; reports put the others in brackets: do not quote them. `loading_only` is judged by the loading alone, as
+    `loading` is, with which it shares its parameters.
+    """
 
     k1: bool
     k2: bool
@@ -66,8 +71,9 @@ class ProtocolResult(Record):
         m_kg: None where the record does not determine it: at constant speed it never does.
         covariance: 3×3, of k1, k2, b in these units. sigma_*: standard deviations.
         error_percent: 100·RMS(F − F̂)/RMS(F), over all samples of both branches (of loading alone for `loading`).
+        residual_uN: RMS of the force's own residual, the noise of the image taken off.
         noise_residual_ratio: RMS residual over that which the noise of force and image alone would leave.
-        identifiable: per parameter; one that is not must not be used as a property of the specimen.
+        identifiable: per parameter; one that is not must not be quoted as a property of the specimen.
     """
 
     k1_uN_per_um: float
@@ -83,12 +89,18 @@ class ProtocolResult(Record):
     noise_residual_ratio: float | None
     condition_number: float | None
     identifiable: Identifiable
+    residual_uN: float | None = None
 
 
 class Misfit(Record):
-    """A test of the residual's structure: is what the best fit leaves over noise, or an effect outside the model?"""
+    """A test of the residual's structure: is what the best fit leaves over noise, or an effect outside the model?
+
+    `statistic` and `p_value` are of the residual's order (Ljung and Box). `found_by` says what found it: this `order`,
+    or, in records too short for it, the `size` alone, whatever `p_value`; None if nothing was found.
+    """
 
     found: bool
+    found_by: Literal["order", "size"] | None = None
     statistic: float | None
     p_value: float | None
     text: str
@@ -193,7 +205,10 @@ class ForceResult(Record):
         file.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
     def write_specimen(self, file: Path) -> None:
-        """Write `specimen.yaml`: what is needed to read force from the camera, and what it is valid for."""
+        """Write `specimen.yaml`: what is needed to read force from the camera, and what it is valid for.
+
+        `microdrivers.results.specimen.read_specimen` reads it.
+        """
         best = self.protocols[self.best]
         content = {
             "schema_version": self.schema_version,
@@ -205,6 +220,8 @@ class ForceResult(Record):
             "b_unloading_uN_s_per_um": best.b_unloading_uN_s_per_um,
             "m_kg": best.m_kg,
             "covariance_of_k1_k2_b": best.covariance,
+            "contact_um": self.contact.deformation_um,
+            "residual_uN": best.residual_uN,
             "slip": None if self.slip is None or self.best != "slip_corrected" else self.slip.model_dump(mode="json"),
             "identifiable": best.identifiable.model_dump(mode="json"),
             "misfit": self.misfit.found,

@@ -35,13 +35,19 @@ def buses_of(devices: Iterable[Device[Any]]) -> Mapping[str, Sequence[Device[Any
     return found
 
 
-def check_bus(name: str, devices: Sequence[Device[Any]]) -> BusDiagnosis:
-    """Let all open devices of a bus stream at once, at the rates that they are used with, and look at the bus."""
+def check_bus(name: str, devices: Sequence[Device[Any]]) -> BusDiagnosis | None:
+    """Let all open devices of a bus stream at once, at the rates that they are used with, and look at the bus.
+
+    None if no device is open and the bus has carried nothing, since it could not be opened, which its devices say.
+    """
     found = BusDiagnosis(name=name, devices=[device.name for device in devices])
     streaming = [device for device in devices if device.link == "open"]
     if streaming:
         _check_load(streaming, found)
-    _check_counters(_facts(devices), found)
+    facts = _facts(devices)
+    if not streaming and not any(facts.counters.values()):
+        return None
+    _check_counters(facts, found)
     return found
 
 

@@ -84,7 +84,9 @@ def diagnose(rig: Rig, *, motion: bool = False, progress: Progress | None = None
     for bus, devices in buses_of(rig.devices.values()).items():
         if progress is not None:
             progress.step(f"examining {bus}")
-        buses.append(check_bus(bus, devices))
+        examined = check_bus(bus, devices)
+        if examined is not None:
+            buses.append(examined)
     return Diagnosis(
         rig=rig.file.name,
         file=str(rig.description.file),
@@ -205,7 +207,8 @@ def _check_motion(stage: Stage[Any], found: DeviceDiagnosis) -> None:
     for axis in _linear_axes(stage):
         if not stage.referenced[axis]:
             found.warn(
-                f"axis {axis} was not moved: it is not referenced", f"reference([{axis!r}]), then run the doctor again"
+                f"axis {axis} was not moved: it is not referenced",
+                f"reference({stage.to_reference([axis])!r}), then run the doctor again",
             )
             continue
         home = _pose(stage)[axis]

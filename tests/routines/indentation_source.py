@@ -11,6 +11,7 @@ from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.samples import ForceSample
 from microdrivers.routines.force.source import IndentationNames, IndentationSetup, Rests
+from microdrivers.routines.past_run import PastRun
 
 K1, K2, B = 3.0, 2e-4, 20.0
 SPEED_UM_S, DEPTH_UM, PERIOD_NS = 5.0, 60.0, 33_333_333
@@ -23,6 +24,7 @@ class MadeUpSource:
     saturated from `range_uN` on; the picture drifts, as a tip at rest shows, which `stuck_uN` holds at the end.
     """
 
+    past_run = PastRun()
     repeatable = True
 
     def __init__(

@@ -1,5 +1,7 @@
 """The characterisation, whatever publishes the samples: found again, kept when it ends badly, told in the result."""
 
+import contextlib
+import json
 import pathlib
 
 import numpy as np
@@ -7,13 +9,15 @@ import pytest
 
 from microdrivers.core.clock import utc_now
 from microdrivers.core.contact_samples import SpecimenEstimate, VisionForceSample
-from microdrivers.core.errors import DataError, LinkLost, SaturatedData
+from microdrivers.core.errors import ConfigError, DataError, LinkLost, SaturatedData
+from microdrivers.core.samples import RoutineNote
 from microdrivers.estimators.force.identify import identify
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.recording.indentation_table import IndentationTable
 from microdrivers.report.force_report import force_report_html
 from microdrivers.report.force_summary import force_summary
 from microdrivers.results.force import read_force_result
+from microdrivers.results.specimen import read_specimen
 from microdrivers.routines.force import Characterisation, IndentationPlayback, build_result
 from microdrivers.routines.provenance import describe_run
 from tests.routines.indentation_source import K1, K2, SPEED_UM_S, B, MadeUpSource
@@ -84,6 +88,26 @@ def test_the_result_reads_back(characterised, tmp_path):
     assert "k1_uN_per_um" in (tmp_path / "specimen.yaml").read_text()
 
 
+def test_the_specimen_file_reads_force_as_the_run_did(characterised, tmp_path):
+    _, run, result, _ = characterised
+    result.write_specimen(tmp_path / "specimen.yaml")
+    known = run.identification.protocols[run.identification.best].model()
+    model = read_specimen(tmp_path / "specimen.yaml")
+    # The file's covariance has the scale's own uncertainty besides, and its range is the speed of the tool.
+    assert len(model.covariance) == 9
+    assert model._replace(covariance=(), fastest_um_s=0.0) == known._replace(covariance=(), fastest_um_s=0.0)
+    assert model.residual_uN > 0.0
+    assert model.fastest_um_s == result.setup.speed_um_s
+
+
+def test_a_specimen_file_without_what_it_needs_is_refused(characterised, tmp_path):
+    file = tmp_path / "specimen.yaml"
+    characterised[2].write_specimen(file)
+    file.write_text(file.read_text().replace("contact_um", "contact"))
+    with pytest.raises(ConfigError, match="contact_um"):
+        read_specimen(file)
+
+
 def test_page_and_summary_tell_every_protocol(characterised):
     _, _, result, _ = characterised
     page, summary = force_report_html(result), force_summary(result)
@@ -93,6 +117,18 @@ def test_page_and_summary_tell_every_protocol(characterised):
     assert page.count("<svg") == 4
     assert "<script" not in page
     assert max(len(line) for line in summary.splitlines()) <= 120
+
+
+def test_a_model_that_does_not_fit_is_said_beside_its_numbers(characterised):
+    _, _, result, _ = characterised
+    (note,) = [note for note in result.notes if note.startswith("The model does not explain the record as fitted by")]
+    assert "unloading_springs (" in note
+    assert "× noise" in note
+    assert "single" not in note
+    summary = force_summary(result)
+    assert "In brackets" in summary
+    (row,) = [line for line in summary.splitlines() if line.startswith("  unloading_springs")]
+    assert row.count("(") == 3
 
 
 def test_the_same_samples_give_the_same_bits():
@@ -118,6 +154,18 @@ def test_an_interruption_identifies_what_there_is():
     assert list(result.protocols) == ["loading"]
     assert result.protocols["loading"].k1_uN_per_um == pytest.approx(K1, rel=0.1)
     assert source.finished == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(KeyboardInterrupt(), "it was interrupted"), (LinkLost("cut"), "cut"), (None, "")],
+)
+def test_the_end_is_noted_for_a_replay(error, told):
+    source = MadeUpSource(broken_off_at=420 if error is not None else None, error=error)
+    with contextlib.suppress(LinkLost):
+        Characterisation(source).run(check=False)
+    done = source.bus.topic("routine", RoutineNote).latest
+    assert (done.kind, json.loads(done.content)) == ("force/done", {"ended_by": told})
 
 
 def test_an_interruption_before_anything_touched_is_told():
@@ -196,5 +244,7 @@ def test_a_real_indentation_is_fitted_as_well_as_it_can_be():
     assert result.protocols["single"].error_percent <= 16.0
     assert not result.protocols["loading"].identifiable.b
     assert result.misfit.found
+    assert result.misfit.found_by == "size"
+    assert result.misfit.p_value > 0.01
     assert result.vision_force_error_percent is None
     assert result.setup.speed_um_s >= SPEED_UM_S

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from microdrivers.core.clock import SimulatedClock
-from microdrivers.core.errors import MicrodriversError, MoveCancelled, NoContact, OutOfRange, TargetLost
+from microdrivers.core.errors import DataError, MicrodriversError, MoveCancelled, NoContact, OutOfRange, TargetLost
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.vision.contact_patch import contact_patch
 from microdrivers.rig import open_rig
@@ -146,6 +146,17 @@ def test_the_limit_of_force_ends_the_press_before_the_guard_must_act(rig, monkey
     assert error is None
     assert 190.0 < max(sample.force_uN for sample in characterisation.first.samples) < 215.0
     assert set(depths_um) == {SHORT.depth_um}  # the patch stays in view as deep as is pressed
+
+
+def test_a_limit_that_ends_the_press_at_once_is_named(rig):
+    characterisation, error = run(rig, SHORT._replace(max_force_uN=20.0))
+    assert isinstance(error, DataError)
+    assert not isinstance(error, NoContact)
+    assert "turned back at" in error.what
+    assert "beyond the limit of 20 µN" in error.what
+    assert "press slower than 40 µm/s" in error.remedy
+    assert len(characterisation.first.frames) > 20
+    assert probe_um(rig) > -490.0 + AWAY_UM
 
 
 def test_settings_that_cannot_be_are_refused(rig):

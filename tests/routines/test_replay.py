@@ -21,6 +21,8 @@ from microdrivers.routines.force import (
 )
 from microdrivers.routines.force.source import READY
 from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsReplay, calibrate_optics
+from microdrivers.routines.optics.calibration import build_result as build_optics_result
+from microdrivers.routines.progress import SilentProgress
 from microdrivers.routines.provenance import describe_run
 from tests.routines.small_rig import SHORT, small_rig
 
@@ -53,6 +55,28 @@ def test_a_recorded_calibration_gives_the_same_bits(calibrated):
     assert bits(again.estimates) == bits(run.estimates)
     assert again.arrivals == run.arrivals
     assert again.optics == run.optics
+
+
+def test_an_interrupted_calibration_stays_one_when_it_is_replayed(tmp_path):
+    class Interrupting(SilentProgress):
+        def count(self, done, total):
+            if done >= 30:
+                raise KeyboardInterrupt
+
+    provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
+    with (
+        open_rig(shipped_rig("microscope"), fake=True, seed=2, clock=SimulatedClock()) as rig,
+        recorder_of(tmp_path / "run.mcap", rig) as recorder,
+    ):
+        source = CircleExperiment(rig, CircleSettings(frames=60, zoom_to=0.9))
+        calibrate_optics(
+            source, progress=Interrupting(), on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals)
+        )
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert recording.complete
+        result = build_optics_result(calibrate_optics(OpticsReplay(recording)), provenance)
+    assert not result.complete
+    assert result.notes[0].startswith("The recorded run ended early: it was interrupted.")
 
 
 def test_the_estimator_sees_what_it_saw(calibrated):
@@ -211,7 +235,7 @@ def test_the_experiment_notes_what_its_replay_needs(indented):
     with Recording(file) as recording:
         kinds = [sample.kind for _, sample in recording.samples(("routine",))]
         frames = sum(isinstance(sample, Frame) for _, sample in recording.samples(("camera_fine",)))
-    assert kinds == [READY, "force/begin", "force/end", "force/begin", "force/end"]
+    assert kinds == [READY, "force/begin", "force/end", "force/begin", "force/end", "force/done"]
     assert frames > 100
 
 

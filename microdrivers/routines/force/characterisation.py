@@ -25,7 +25,9 @@ from microdrivers.estimators.force.recursion import SpecimenRecursion
 from microdrivers.estimators.force.vision_force import VisionForce
 from microdrivers.estimators.vision.image_drift import ImageDrift
 from microdrivers.routines.force.frames import all_frames, drift_of, record_of, without_drift
-from microdrivers.routines.force.source import FrameTracker, IndentationSetup, IndentationSource, host_name
+from microdrivers.routines.force.source import DONE, FrameTracker, IndentationSetup, IndentationSource, host_name
+from microdrivers.routines.notes import note
+from microdrivers.routines.past_run import INTERRUPTED, PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
 
@@ -56,7 +58,7 @@ class Indentation(NamedTuple):
 class ForceRun(NamedTuple):
     """What a characterisation left behind; `check` is the fresh indentation, if there was one.
 
-    `complete` is False if it ended early; `ended_by` says by what.
+    `complete` is False if it ended early; `ended_by` says by what. `past_run` is what a recording tells of its run.
     """
 
     complete: bool
@@ -66,6 +68,7 @@ class ForceRun(NamedTuple):
     identification: Identification
     check: Indentation | None
     setup: IndentationSetup
+    past_run: PastRun
 
 
 class Characterisation:
@@ -101,15 +104,23 @@ class Characterisation:
             NoContact, IllConditioned and other DataError or CalibrationError: the record does not show or determine
                 a specimen. MicrodriversError: whatever the source raises. See `partial` for what is left then.
         """
+        ended_by = "an error of the program"
         try:
             self._experiment(progress or SilentProgress(), check=check)
         except KeyboardInterrupt:
             self.interrupted = True
+            ended_by = INTERRUPTED
+        except MicrodriversError as error:
+            ended_by = error.what
+            raise
+        else:
+            ended_by = ""
         finally:
             self._source.finish()
+            note(self._source.bus, self._source.clock, DONE, {"ended_by": ended_by})
         if self.first is None:
             raise NoContact("interrupted before anything was measured", remedy="start again")
-        return self._found("it was interrupted" if self.interrupted else "")
+        return self._found(ended_by or self._source.past_run.ended_by)
 
     def partial(self, error: MicrodriversError) -> ForceRun | None:
         """What had been measured before `run` ended with this error, identified; None if that tells nothing."""
@@ -136,9 +147,11 @@ class Characterisation:
         if self._record is None or self._identification is None:
             self._record = record_of(self.first.frames)
             self._identification = identify(self._record)
+        source = self._source
         return ForceRun(
-            not ended_by, ended_by, self.first, self._record, self._identification, self.check, self._source.setup()
-        )
+            not ended_by, ended_by, self.first, self._record, self._identification, self.check, source.setup(),
+            source.past_run,
+        )  # fmt: skip
 
     def _indent(self, tracker: FrameTracker | None, model: SpecimenModel | None, progress: Progress) -> None:
         """One indentation: `first` or, with a model of the specimen, `check`; kept whatever ends it."""

@@ -8,11 +8,14 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.recording.indentation_table import IndentationTable
 from microdrivers.routines.force.source import FrameTracker, IndentationNames, IndentationSetup, Rests
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 
 class IndentationPlayback:
     """Publishes a recorded indentation, once."""
+
+    past_run = PastRun()
 
     def __init__(self, table: IndentationTable) -> None:
         self.bus = Bus()

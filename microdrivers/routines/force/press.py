@@ -10,13 +10,12 @@ from typing import NamedTuple
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced, OutOfRange
 from microdrivers.core.samples import ForceSample, Frame
-from microdrivers.core.units import check_range
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
-from microdrivers.routines.force.press_settings import DEPTHS_UM, SPEEDS_UM_S, PressSettings
+from microdrivers.routines.force.press_settings import PressSettings
 from microdrivers.routines.force.sight import Sight
 from microdrivers.routines.force.source import (
     BEGIN,
@@ -30,6 +29,7 @@ from microdrivers.routines.force.source import (
 from microdrivers.routines.force.watches import Felt, Lost
 from microdrivers.routines.force.way import ProbingWay
 from microdrivers.routines.notes import note
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 _LOOK_S = 0.05
@@ -47,6 +47,7 @@ _WATCH_S, _WATCH_FRAMES, _RECOVERED_UM, _LONGEST_RECOVERY_S = 0.5, 8, 0.1, 120.0
 class PressExperiment:
     """Presses the rig's probe on the specimen before it; see `PressSettings`."""
 
+    past_run = PastRun()
     repeatable = True
 
     def __init__(self, rig: Rig, settings: PressSettings | None = None, *, sight: Sight | None = None) -> None:
@@ -58,6 +59,7 @@ class PressExperiment:
                 remedy="add a probe section: stage, force, camera, ready_um",
             )
         self.settings = settings or PressSettings()
+        self.settings.check()
         self.bus = rig.bus
         self.clock = rig.clock
         self.names = IndentationNames(section.force, f"{section.camera}/deformation", section.camera)
@@ -73,12 +75,6 @@ class PressExperiment:
         self._near = False
         self._indented = False
         self._watcher: FrameTracker | None = None
-        self._check_settings()
-
-    def _check_settings(self) -> None:
-        asked = self.settings
-        check_range(asked.speed_um_s, SPEEDS_UM_S, what="speed of the probe", unit="µm/s")
-        check_range(asked.depth_um, DEPTHS_UM, what="depth of the indentation", unit="µm")
 
     def _force_limit_uN(self) -> float:
         ceiling = min(abs(self._sensor.range_uN.min), abs(self._sensor.range_uN.max))
@@ -232,7 +228,7 @@ class PressExperiment:
             begin()
             self.clock.sleep(_AFTER_S)
             until_ns, rested_um = self.clock.now_ns(), way.place_um(self._stage.read().position)
-            self._run(way, end_um, lambda: felt.enough or lost.too_long, lambda um: show(um, back=False))
+            deepest_um = self._run(way, end_um, lambda: felt.enough or lost.too_long, lambda um: show(um, back=False))
             lost.raise_if_too_long(self._camera.name)
             if asked.hold_s:
                 self.clock.sleep(asked.hold_s)
@@ -243,6 +239,8 @@ class PressExperiment:
             # A place read at rest is off by up to half a step, either time.
             rests = Rests(until_ns, since_ns, back_um - rested_um, way.step_um / math.sqrt(6.0))
             note(self.bus, self.clock, END, rests._asdict())
+        pressed_um = deepest_um - self._contact_um
+        felt.raise_if_too_soon(pressed_um, speed_um_s=asked.speed_um_s, sensor=self._sensor.name)
         return rests
 
     def _let_recover(self, progress: Progress) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-from microdrivers.core.units import Range
+from microdrivers.core.errors import OutOfRange
+from microdrivers.core.units import Range, check_range
 
 SPEEDS_UM_S = Range(0.1, 100.0)
 DEPTHS_UM = Range(5.0, 1000.0)
+HOLDS_S = Range(0.0, 3600.0)
 
 
 class PressSettings(NamedTuple):
@@ -33,3 +36,18 @@ class PressSettings(NamedTuple):
     most_approach_um: float = 200.0
     back_off_um: float = 15.0
     rest_s: float = 5.0
+
+    def check(self) -> None:
+        """Refuse figures that no experiment can have; what a rig allows besides is the experiment's to check.
+
+        Raises:
+            OutOfRange: one is not finite, is negative, or lies outside its range.
+        """
+        check_range(self.speed_um_s, SPEEDS_UM_S, what="speed of the probe", unit="µm/s", in_file="")
+        check_range(self.depth_um, DEPTHS_UM, what="depth of the indentation", unit="µm", in_file="")
+        check_range(self.hold_s, HOLDS_S, what="time at the deepest point", unit="s")
+        for name, value in self._asdict().items():
+            if value is not None and not (math.isfinite(value) and value >= 0.0):
+                raise OutOfRange(f"{name} is {value:g}", remedy="give a finite number that is not negative")
+        if self.max_force_uN == 0.0:
+            raise OutOfRange("max_force_uN is 0", remedy="give a largest force above 0 µN")

@@ -15,6 +15,7 @@ from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
 from microdrivers.routines.force.sight import Sight
 from microdrivers.routines.force.source import (
     BEGIN,
+    DONE,
     END,
     READY,
     FrameTracker,
@@ -23,6 +24,7 @@ from microdrivers.routines.force.source import (
     Rests,
     host_name,
 )
+from microdrivers.routines.past_run import PastRun, past_run
 from microdrivers.routines.progress import Progress
 
 
@@ -47,6 +49,7 @@ class IndentationReplay:
         self._ready = ready[-1]
         self._begins = [note for note in notes if note.kind == BEGIN and note.order > self._ready.order]
         self._ends = [note for note in notes if note.kind == END and note.order > self._ready.order]
+        self._done = [note for note in notes if note.kind == DONE and note.order > self._ready.order]
         self.names = IndentationNames(**self._ready.content["names"])
         self.repeatable = len(self._begins) > 1
         self._inputs = (self.names.sensor, self.names.camera or self.names.deformation)
@@ -108,9 +111,19 @@ class IndentationReplay:
         return Rests(**end.content) if end is not None and end.content else None
 
     def _end(self, number: int) -> Note | None:
-        """The note that ends the indentation; None if it was broken off, and ends with the recording."""
-        later: list[Note] = [note for note in self._ends if note.order > self._begins[number - 1].order]
-        return later[0] if later else None
+        """The note that ends the indentation; None if it was broken off, or the note is lost."""
+        begun = [note.order for note in self._begins[number - 1 : number + 1]]
+        own = [note for note in self._ends if begun and begun[0] < note.order and not note.order > begun[-1] > begun[0]]
+        return own[0] if own else None
+
+    @property
+    def past_run(self) -> PastRun:
+        """What the recording says of it."""
+        broken_off = ""
+        if self._end(len(self._begins)) is None:
+            how = "the recorded run" if self._recording.complete else "the recording was cut off, and"
+            broken_off = f"{how} ends before indentation {max(1, len(self._begins))} was over"
+        return past_run(self._recording, self._done, missing=self._replay.missing, broken_off=broken_off)
 
     def finish(self) -> None:
         """Publish what is left."""

@@ -51,6 +51,7 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
         slip=_slip(run),
         misfit=Misfit(
             found=best.misfit.found,
+            found_by=best.misfit.found_by,
             statistic=_known(best.misfit.statistic),
             p_value=_known(best.misfit.p_value),
             text=best.misfit.text,
@@ -110,6 +111,7 @@ def _protocol(fit: ProtocolFit, scale_sigma: float) -> ProtocolResult:
         error_percent=fit.error_percent,
         noise_residual_ratio=_known(fit.noise_residual_ratio),
         condition_number=_known(fit.condition_number),
+        residual_uN=_known(fit.residual_uN),
         identifiable=Identifiable(
             **{name: fit.identifiable.get(name, False) for name in ("k1", "k2", "b", "m")}, reasons=dict(fit.weak)
         ),
@@ -202,8 +204,19 @@ def _known(value: float) -> float | None:
 
 def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
     notes = [f"{note[0].upper()}{note[1:]}." for note in run.identification.notes]
+    protocols = run.identification.protocols
+    beyond = [
+        f"{name} ({fit.noise_residual_ratio:.3g} × noise)"
+        for name, fit in protocols.items()
+        if fit.misfit.found and not all(fit.identifiable[key] for key in ("k1", "k2", "b"))
+    ]
+    if beyond:
+        notes.append(
+            f"The model does not explain the record as fitted by {', '.join(beyond)}: do not quote its numbers."
+        )
     if not run.complete:
         notes.append(f"The run ended early: {run.ended_by}. The result holds what had been measured until then.")
+    notes += run.past_run.notes()
     lost = run.first.unmatched.get("LOST", 0)
     if lost:
         notes.append(f"The contact point was not seen in {lost} frames.")
@@ -212,7 +225,7 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
             f"{check.outside_range} of {check.samples} frames of the fresh indentation lie outside the range in which "
             "the model was identified."
         )
-    best = run.identification.protocols[run.identification.best]
+    best = protocols[run.identification.best]
     if best.misfit.found:
         notes.append(
             "The model does not explain this specimen within the noise: use its parameters with care, and its force "

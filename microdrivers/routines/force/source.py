@@ -9,10 +9,11 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.samples import Frame
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
-READY, BEGIN, END = "force/ready", "force/begin", "force/end"
-"""The routine's notes: all is ready for indentations, one begins, it has ended."""
+READY, BEGIN, END, DONE = "force/ready", "force/begin", "force/end", "force/done"
+"""The routine's notes: all is ready for indentations, one begins, it has ended; the run is over, early by what."""
 
 
 def host_name(number: int) -> str:
@@ -81,6 +82,10 @@ class IndentationSource(Protocol):
     clock: Clock
     names: IndentationNames
     repeatable: bool
+
+    @property
+    def past_run(self) -> PastRun:
+        """What a recording tells of its run, valid after `indent`."""
 
     def prepare(self, progress: Progress) -> FrameTracker | None:
         """Make everything ready for an indentation; returns what finds the deformation in frames."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 from microdrivers.core.contact_samples import DeformationSample
-from microdrivers.core.errors import TargetLost
+from microdrivers.core.errors import DataError, TargetLost
 from microdrivers.core.samples import ForceSample
+from microdrivers.routines.force.press_settings import DEPTHS_UM
 
 LOST_FRAMES = 15
 
@@ -33,6 +34,23 @@ class Felt:
         self._beyond = self._beyond + 1 if beyond else 0
         if beyond:
             self.force_uN = sample.force_uN
+
+    def raise_if_too_soon(self, depth_um: float, *, speed_um_s: float, sensor: str) -> None:
+        """Raise if the threshold, taken for the limit of a press, was reached before anything could be learnt.
+
+        Raises:
+            DataError: it was reached in less than the smallest depth that may be asked for.
+        """
+        if not self.enough or depth_um >= DEPTHS_UM.min:
+            return
+        raise DataError(
+            f"turned back at {self.force_uN:.4g} µN, beyond the limit of {self._threshold_uN:.4g} µN, after "
+            f"{max(depth_um, 0.0):.1f} µm from contact: too little to tell springs from a damper",
+            device=sensor,
+            remedy=f"press slower than {speed_um_s:g} µm/s (a damper's force b·v is there from the first µm on), or "
+            "allow more force: --max-force-uN, and the guard's limit in the rig file's safety section",
+            moved="yes",
+        )
 
 
 class Lost:

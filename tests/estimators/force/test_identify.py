@@ -220,7 +220,7 @@ def test_every_sample_is_either_used_or_excluded_for_one_reason():
     left_out = np.concatenate(list(found.excluded_samples.values()))
     assert len(np.unique(left_out)) == len(left_out)
     assert set(found.branches.approach) == set(found.excluded_samples["before contact"])
-    assert set(found.branches.lost) == set(found.excluded_samples["lost contact"])
+    assert set(found.branches.lost) == set(found.excluded_samples["after the tip had left"])
     turns = [found.branches.loading.stop, found.branches.hold.stop]
     assert {turn + k for turn in turns for k in (-2, -1, 0, 1)} <= set(
         found.excluded_samples["around contact and reversals"]
@@ -305,3 +305,22 @@ def test_results_are_finite_and_complete():
                 assert math.isfinite(value), field.name
         assert np.isfinite(fit.force_uN).all()
         assert set(fit.weak) == {name for name, known in fit.identifiable.items() if not known}
+
+
+@pytest.mark.parametrize("preset", [*MODELLED, "viscoelastic"])
+def test_numbers_of_a_model_that_does_not_explain_the_record_are_marked(preset):
+    found = identified(preset)
+    for name, fit in found.protocols.items():
+        if fit.noise_residual_ratio > 2.0 and name != "loading_only":
+            assert not any(fit.identifiable[key] for key in ("k1", "k2", "b")), name
+            assert "the model does not explain the record" in fit.weak["k2"]
+            assert "× noise" in fit.weak["k2"]
+    assert found.slip.identifiable == (preset == "slip_corrected")
+
+
+@pytest.mark.parametrize("preset", [*MODELLED, "viscoelastic"])
+def test_what_only_the_loading_says_is_as_good_as_the_loading(preset):
+    protocols = identified(preset).protocols
+    assert protocols["loading_only"].k1_uN_per_um == protocols["loading"].k1_uN_per_um
+    assert protocols["loading_only"].identifiable == protocols["loading"].identifiable
+    assert protocols["loading"].identifiable["k1"] == (preset in ("single", "unloading_springs"))

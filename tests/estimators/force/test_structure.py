@@ -42,6 +42,7 @@ def test_a_slow_residual_is_a_misfit():
     assert found.found
     assert found.structured_uN == pytest.approx(0.4 * 2.0 / np.sqrt(2.0), rel=0.1)
     assert found.p_value < 1e-6
+    assert found.found_by == "order"
     assert "misfit" in found.text
 
 
@@ -57,6 +58,17 @@ def test_far_more_than_the_noise_is_a_misfit_however_short():
     found = structure_test([np.ones(18)], np.arange(18), np.full(18, 5.0), np.ones(18))
     assert found.p_value == 1.0
     assert found.found
+    assert found.found_by == "size"
+    assert "5 times what noise leaves, p = 1 of its order" in found.text
+
+
+def test_much_more_than_noise_without_anything_slow_does_not_contradict_itself():
+    residual = 3.0 * (-1.0) ** np.arange(900)
+    found = structure_test([residual], np.arange(900), residual, np.ones(900))
+    assert not found.found
+    assert found.found_by is None
+    assert "more than noise, but little of it is slow" in found.text
+    assert "less than the noise" not in found.text
 
 
 def test_samples_on_either_side_of_a_gap_are_no_neighbours():
