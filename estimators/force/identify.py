@@ -142,7 +142,7 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
         deformation_sigma_um=prepared.deformation_sigma_um,
         force_sigma_uN=prepared.force_sigma_uN,
         knots_s=fits[best].spacing_s,
-        notes=tuple(_notes(record, prepared)),
+        notes=tuple(_notes(record, prepared, both_ways="single" in protocols)),
     )
 
 
@@ -256,7 +256,7 @@ def _slip(prepared: Prepared, fit: ProtocolFit | None, is_best: bool) -> Slip | 
     )
 
 
-def _notes(record: IndentationRecord, prepared: Prepared) -> list[str]:
+def _notes(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) -> list[str]:
     notes = doubts(prepared)
     for what, stated, used, unit in (
         ("deformation", record.deformation_sigma_um, prepared.deformation_sigma_um, "µm"),
@@ -277,6 +277,8 @@ def _notes(record: IndentationRecord, prepared: Prepared) -> list[str]:
         notes.append(f"contact was lost at {parts.release_s:.2f} s, while the deformation still grew")
     if not len(parts.unloading):
         notes.append("the record has no unloading: only the loading is fitted")
+    elif not both_ways:
+        notes.append("the tip left the specimen soon after it turned back: only the loading is fitted")
     elif parts.release_s is None:
         notes.append("the record ends in contact")
     return notes

@@ -23,6 +23,9 @@ from microdrivers.estimators.force.protocols import (
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.force.trajectory import KNOT_SPACINGS_S, RAMP
 
+_FEWEST_OF_UNLOADING = 3
+"""Samples of the way back: with fewer its two springs are no fit."""
+
 _FIRST_MARGIN_S = 0.5
 _ROUNDS = 3
 _SETTLED = 10.0
@@ -104,7 +107,8 @@ def _any_fits(fits: Mapping[ProtocolName, Fit]) -> bool:
 def _over_both(prepared: Prepared) -> Fits:
     """The protocols that mean to explain everything that was recorded, on ramps."""
     whole: tuple[ProtocolName, ...] = ("single", "unloading_springs", "slip_corrected")
-    names: tuple[ProtocolName, ...] = whole if np.any(prepared.branch == UNLOADING) else ("loading",)
+    enough = np.count_nonzero(prepared.branch == UNLOADING) >= _FEWEST_OF_UNLOADING
+    names: tuple[ProtocolName, ...] = whole if enough else ("loading",)
     return {name: fit_protocol(prepared, _PROTOCOLS[name], RAMP) for name in names}
 
 

@@ -324,3 +324,13 @@ def test_what_only_the_loading_says_is_as_good_as_the_loading(preset):
     assert protocols["loading_only"].k1_uN_per_um == protocols["loading"].k1_uN_per_um
     assert protocols["loading_only"].identifiable == protocols["loading"].identifiable
     assert protocols["loading"].identifiable["k1"] == (preset in ("single", "unloading_springs"))
+
+
+@pytest.mark.parametrize("depth_um", [25.0, 30.0, 35.0])
+def test_a_tip_that_leaves_soon_after_it_turned_back_gives_the_loading_alone(depth_um):
+    # The damper's force ends the contact at once where the springs are hardly compressed.
+    found = identify(recorded("single", Push(depth_um=depth_um)))
+    assert is_near(found.protocols["loading"], PRESETS["single"], k1=5e-3, k2=0.2, b=5e-3)
+    if "single" not in found.protocols:
+        assert found.best == "loading"
+        assert any("only the loading is fitted" in note for note in found.notes)
