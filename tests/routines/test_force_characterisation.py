@@ -243,6 +243,7 @@ def test_a_real_indentation_is_fitted_as_well_as_it_can_be():
     assert 5.0 <= result.protocols["loading"].error_percent <= 5.6  # the best possible is 5.31 %
     assert result.protocols["single"].error_percent <= 16.0
     assert not result.protocols["loading"].identifiable.b
+    assert result.largest_speed_um_s is None  # nothing that the damper would have to tell
     assert result.misfit.found
     assert result.misfit.found_by == "size"
     assert result.misfit.p_value > 0.01

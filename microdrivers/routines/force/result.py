@@ -143,7 +143,9 @@ def _slip(run: ForceRun) -> SlipFit | None:
 
 
 def _speed_limit(best: ProtocolFit, force_uN: float) -> float | None:
-    """What keeps the predicted force at the deepest point below the largest that was measured."""
+    """What keeps the predicted force at the deepest point below the largest that was measured, if the model holds."""
+    if not (best.identifiable["k1"] and best.identifiable["b"]):
+        return None
     try:
         return _known(largest_speed_um_s(best.model(), max_force_uN=force_uN, depth_um=best.deepest_um))
     except MicrodriversError:  # the model says nothing about speeds here
