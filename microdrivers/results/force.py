@@ -177,8 +177,8 @@ class ForceResult(Record):
         best: the protocol that suits the record best.
         excluded_samples: reason → number of samples that no fit used.
         vision_force_error_percent: 100·RMS(F − F̂)/RMS(F) of the fresh indentation; None if there was none.
-        largest_speed_um_s: keeps the predicted force below `setup.largest_force_uN` at the deepest point; null where the record
-            does not determine k1 and b.
+        largest_speed_um_s: keeps the predicted force below `setup.largest_force_uN` at the deepest point; null
+            where the record does not determine k1 and b.
     """
 
     schema_version: Literal[1] = 1

@@ -16,11 +16,13 @@ from microdrivers.recording.reader import Recording
 def disk_with(size):
     """No file of this process may grow larger: the kernel refuses the write, as it does on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    keeps_no_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would be cut off, and stay so
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        sys.dont_write_bytecode = keeps_no_bytecode
 
 
 @pytest.mark.parametrize("on_failure", ["stop", "go-on"])
