@@ -174,14 +174,15 @@ def _minimise(bands: Bands, parameters: FloatArray) -> _Solution | None:
     damping, converged = 1e-5, False
     here = _linearise(bands, parameters, work)
     try:
-        for _ in range(_MAX_ITERATIONS):
+        for iteration in range(_MAX_ITERATIONS):
             damped = here.normal.copy()
             damped.ravel()[:: _PARAMETERS + 1] *= 1.0 + damping
             step = np.linalg.solve(damped, here.gradient)
             largest = float(np.abs(step[: _LOG_BLUR + 1]).max())
             if not largest < _MAX_STEP:
                 return None
-            if largest < _CONVERGED_PX:
+            # Not in the first: lines that begin where they end say nothing of grey levels, which make the residuals.
+            if largest < _CONVERGED_PX and iteration > 0:
                 parameters = parameters + step
                 converged = True
                 break
