@@ -20,6 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from bench_wires.figures import Figure, show
+
 from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.recording.header import describe_recording
@@ -115,14 +117,14 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=20)
     parser.add_argument("--folder", type=Path)
     arguments = parser.parse_args()
-    rows: list[tuple[str, str, str, bool]] = []
+    rows: list[Figure] = []
 
     def add_speed(what: str, must: float, recorded_s: float, call: Callable[[], object], *, times: int) -> None:
         call()
         took = min(timed(call) for _ in range(times))
         factor = recorded_s / took.cpu_s
         told = f"{factor:.0f} × ({recorded_s / took.wall_s:.0f} × by the wall clock)"
-        rows.append((what, f"≥ {must:g} ×", told, factor >= must))
+        rows.append(Figure(what, f"≥ {must:g} ×", told, factor >= must))
 
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
         folder = Path(name)
@@ -147,23 +149,20 @@ def main() -> int:
         what = f"{arguments.recordings} recordings, --jobs 2 against --jobs 1"
         load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
         told = f"{one_s / two_s:.2f} × ({one_s:.1f} s, {two_s:.1f} s; {load})"
-        rows.append((what, "≥ 1.7 ×", told, one_s / two_s >= 1.7))
+        rows.append(Figure(what, "≥ 1.7 ×", told, one_s / two_s >= 1.7))
         middle = killed_and_resumed(runs, folder / "3.csv")
         tables = {(folder / f"{number}.csv").read_bytes() for number in (1, 2, 3)}
         rows.append(
-            (
+            Figure(
                 "tables of 1 and 2 jobs, killed and resumed",
                 "identical",
                 "identical" if len(tables) == 1 else "different",
                 len(tables) == 1,
             )
         )
-        rows.append(("  it was killed in the middle", "yes", "yes" if middle else "no", middle))
-    width = max(len(row[0]) for row in rows)
-    print(f"{'figure':<{width}} | must reach | measured")
-    for figure, must, measured, reached in rows:
-        print(f"{figure:<{width}} | {must:<10} | {measured}{'' if reached else '   <-- falls short'}")
-    return 0 if all(reached for *_, reached in rows) else 1
+        rows.append(Figure("  it was killed in the middle", "yes", "yes" if middle else "no", middle))
+    show(rows)
+    return 0 if all(row.reached for row in rows) else 1
 
 
 if __name__ == "__main__":

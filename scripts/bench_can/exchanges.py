@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
-from bench_wires.figures import Figure, Times
+from bench_wires.figures import Figure, Times, in_rounds
 
 from bench_can.tools import STAGE, bring_home, simulated
 from microdrivers.backends.canopen.objects import DEVICE_TYPE
@@ -35,12 +34,13 @@ def measure(repeat: float) -> list[Figure]:
         def stream() -> None:
             rig.clock.sleep(1 / _STREAM_HZ)
 
-        rounds = round(_ROUNDS * repeat) + 2
-        scale = _in_rounds({"loop": _loop}, rounds)["loop"]
-        asked = _in_rounds({"SDO": lambda: sdo.read(DEVICE_TYPE), "pose": stage.read}, rounds)
+        rounds = round(_ROUNDS * repeat) + 1
+        scale = in_rounds({"loop": _loop}, rounds, in_a_round=_IN_A_ROUND)["loop"]
+        calls: dict[str, Callable[[], object]] = {"SDO": lambda: sdo.read(DEVICE_TYPE), "pose": stage.read}
+        asked = in_rounds(calls, rounds, in_a_round=_IN_A_ROUND)
         poses.clear()
         with stage.stream(_STREAM_HZ):
-            streamed = _in_rounds({"pose": stream}, rounds)["pose"]
+            streamed = in_rounds({"pose": stream}, rounds, in_a_round=_IN_A_ROUND)["pose"]
         assert len(poses) >= rounds * _IN_A_ROUND
     return [
         Figure("a Python loop of 1000 turns, for scale", "", f"{scale.best_us:.1f} µs in the best round"),
@@ -54,20 +54,6 @@ def _loop() -> None:
     total = 0
     for number in range(1000):
         total += number * number % 7
-
-
-def _in_rounds(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, Times]:
-    """The first round warms up."""
-    found: dict[str, list[list[int]]] = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            times = []
-            for _ in range(_IN_A_ROUND):
-                begun_ns = time.perf_counter_ns()
-                call()
-                times.append(time.perf_counter_ns() - begun_ns)
-            found[name].append(times)
-    return {name: Times(*times[1:]) for name, times in found.items()}
 
 
 def _figure(name: str, times: Times, most_us: float) -> Figure:

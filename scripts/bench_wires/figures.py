@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +36,42 @@ class Times:
     def in_ms(self) -> str:
         """Median, 95th percentile, number."""
         return f"{self.median_us / 1e3:.2f} ms (95 % {self.p95_us / 1e3:.2f}, n {self.number})"
+
+
+def in_rounds(
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int,
+    *,
+    in_a_round: int,
+    pause: Callable[[], object] = lambda: None,
+) -> dict[str, Times]:
+    """Time the calls in turn, `in_a_round` times each; `pause` comes before each and does not count.
+
+    One round more is made at first, which warms up.
+    """
+    found: dict[str, list[list[int]]] = {name: [] for name in calls}
+    for _ in range(rounds + 1):
+        for name, call in calls.items():
+            times = []
+            for _ in range(in_a_round):
+                pause()
+                begun_ns = time.perf_counter_ns()
+                call()
+                times.append(time.perf_counter_ns() - begun_ns)
+            found[name].append(times)
+    return {name: Times(*times[1:]) for name, times in found.items()}
+
+
+def measure_in_turn(kinds: Mapping[str, Callable[[], list[Figure]]], asked: Sequence[str]) -> list[Figure]:
+    """Measure what was asked for, or all; print the table, and how busy the computer was at first."""
+    figures: list[Figure] = []
+    print(f"load average {os.getloadavg()[0]:.2f} on {os.cpu_count()} processors")
+    for kind in asked or kinds:
+        print(f"measuring {kind} …", flush=True)
+        figures += kinds[kind]()
+    print()
+    show(figures)
+    return figures
 
 
 def show(figures: Sequence[Figure]) -> None:

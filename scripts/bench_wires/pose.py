@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from bench_wires.far_end import Bare, FarEnd, Script, device_on, record
-from bench_wires.figures import Figure, Times
+from bench_wires.figures import Figure, Times, in_rounds
 from microdrivers.core.clock import SystemClock
 
 _STAGE = "sample_stage"
@@ -37,10 +36,11 @@ def measure(repeat: float) -> list[Figure]:
         pipython = _pipython(pipython_end.port)
         if pipython is not None:
             cases["pipython"] = pipython
-        times = _in_rounds(cases, round(_ROUNDS * repeat) + 1)
+        times = in_rounds(cases, round(_ROUNDS * repeat) + 1, in_a_round=_IN_A_ROUND)
         for _ in range(15):
             stage.topic.subscribe(deque[Any](maxlen=100).append)
-        crowded = _in_rounds({"bare": cases["bare"], "driver": stage.read}, round(_ROUNDS * repeat / 4) + 1)
+        both = {"bare": cases["bare"], "driver": stage.read}
+        crowded = in_rounds(both, round(_ROUNDS * repeat / 4) + 1, in_a_round=_IN_A_ROUND)
         stage.close()
     clock.close()
     bare = times["bare"]
@@ -77,20 +77,6 @@ def _pose_request(script: Script) -> tuple[bytes, list[bytes]]:
 def _positions_of(reply: bytes) -> bytes:
     """The first reply of a pose: its lines but the last end in a space."""
     return b"".join(reply.splitlines(keepends=True)[:3])
-
-
-def _in_rounds(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, Times]:
-    """The first round warms up."""
-    found: dict[str, list[list[int]]] = {name: [] for name in cases}
-    for _ in range(rounds + 1):
-        for name, call in cases.items():
-            times = []
-            for _ in range(_IN_A_ROUND):
-                begun_ns = time.perf_counter_ns()
-                call()
-                times.append(time.perf_counter_ns() - begun_ns)
-            found[name].append(times)
-    return {name: Times(*times[1:]) for name, times in found.items()}
 
 
 def _pipython(port: str) -> Callable[[], object] | None:

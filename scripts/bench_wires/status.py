@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 
 from bench_wires.far_end import Bare, FarEnd, record, settings_on
-from bench_wires.figures import Figure, Times
+from bench_wires.figures import Figure, Times, in_rounds
 from microdrivers.backends.oriental_az.drive import AzDrive
 from microdrivers.backends.oriental_az.link import az_link
 from microdrivers.core.bus import Bus
@@ -48,8 +48,9 @@ def measure(repeat: float) -> list[Figure]:
         line.open()
         drive = AzDrive(modbus, settings.register_order)
         calls: Calls = {"bare": Bare(bare_end, request, len(reply)).exchange, "drive": drive.read_status}
-        awake = _in_rounds(calls, _pass_awake, repeat)
-        asleep = _in_rounds(calls, lambda: clock.sleep(_PAUSE_S), repeat)
+        rounds = round(_ROUNDS * repeat) + 1
+        awake = in_rounds(calls, rounds, in_a_round=_IN_A_ROUND, pause=_pass_awake)
+        asleep = in_rounds(calls, rounds, in_a_round=_IN_A_ROUND, pause=lambda: clock.sleep(_PAUSE_S))
         line.close()
     clock.close()
     ideal_ns = (len(request) + len(reply)) * _BYTE_NS + _SILENCE_NS
@@ -72,21 +73,6 @@ def _beyond(name: str, times: Times, ideal_ns: int, *, reach: bool = False) -> F
     return Figure(
         name, limit, f"+ {best_ms:.3f} ms in the best round, + {beyond_ms:.3f} in all: {times.in_ms()}", reached
     )
-
-
-def _in_rounds(calls: Calls, pause: Callable[[], object], repeat: float) -> dict[str, Times]:
-    """The first round warms up."""
-    found: dict[str, list[list[int]]] = {name: [] for name in calls}
-    for _ in range(round(_ROUNDS * repeat) + 2):
-        for name, call in calls.items():
-            times = []
-            for _ in range(_IN_A_ROUND):
-                pause()
-                begun_ns = time.perf_counter_ns()
-                call()
-                times.append(time.perf_counter_ns() - begun_ns)
-            found[name].append(times)
-    return {name: Times(*times[1:]) for name, times in found.items()}
 
 
 def _pass_awake() -> None:
