@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from microdrivers.core.clock import Clock
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.fakes.can import Due, Frame
 
 BIT_NS = 2000  # 500 kbit/s
 REPLY_NS = 100_000
+PATIENCE_S = 5.0
 
 SDO_REQUEST = Frame(0x605, bytes.fromhex("4000100000000000"))
 SDO_REPLY = Frame(0x585, bytes.fromhex("4300100092010200"))
+
+
+def wait_until(clock: Clock, condition: Callable[[], bool]) -> None:
+    for _ in range(round(PATIENCE_S / 0.002)):
+        if condition():
+            return
+        clock.sleep(0.002)
+    raise AssertionError("it did not happen")
 
 
 class Listener:

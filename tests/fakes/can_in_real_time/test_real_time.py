@@ -14,38 +14,14 @@ import pytest
 from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.errors import RefusedError, UnsupportedError
 from microdrivers.devices.drivers import Endpoint, ServeRequest
-from microdrivers.fakes.can import Frame, Medium, PortError, forget_medium, serve_medium, shared_medium
+from microdrivers.fakes.can import Frame, Medium, PortError, serve_medium
 from microdrivers.fakes.can.interface_bridge import InterfaceBridge
 from microdrivers.fakes.can.serving import HeldUpPort
-from tests.fakes.can_bench import SDO_REPLY, SDO_REQUEST, Answering, Listener, Periodic
+from tests.fakes.can_bench import PATIENCE_S, SDO_REPLY, SDO_REQUEST, Answering, Listener, Periodic, wait_until
 
 pytestmark = pytest.mark.xdist_group("real_time")
 
 REQUEST = can.Message(arbitration_id=SDO_REQUEST.id, data=SDO_REQUEST.data, is_extended_id=False)
-PATIENCE_S = 5.0
-
-
-@pytest.fixture
-def clock() -> Iterator[SystemClock]:
-    clock = SystemClock()
-    yield clock
-    clock.close()
-    clock.check()
-
-
-@pytest.fixture
-def medium(clock: SystemClock) -> Iterator[Medium]:
-    medium = shared_medium("slcan:/dev/ttyACM0", clock=clock, bitrate=500_000, seed=1)
-    yield medium
-    forget_medium(medium.name, medium)
-
-
-def wait_until(clock: SystemClock, condition: Callable[[], bool]) -> None:
-    for _ in range(round(PATIENCE_S / 0.002)):
-        if condition():
-            return
-        clock.sleep(0.002)
-    raise AssertionError("it did not happen")
 
 
 def exchange(bus: can.BusABC) -> None:

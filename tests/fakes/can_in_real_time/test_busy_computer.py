@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,37 +10,12 @@ import pytest
 
 from microdrivers.core.clock import SystemClock
 from microdrivers.devices.drivers import Endpoint, ServeRequest
-from microdrivers.fakes.can import Frame, Medium, SlcanAdapter, forget_medium, serve_medium, shared_medium
+from microdrivers.fakes.can import Frame, Medium, SlcanAdapter, serve_medium
 from microdrivers.fakes.can.arrival import Arrival
 from microdrivers.fakes.can.frame import Due
-from tests.fakes.can_bench import Listener, Periodic
+from tests.fakes.can_bench import PATIENCE_S, Listener, Periodic, wait_until
 
 pytestmark = pytest.mark.xdist_group("real_time")
-
-PATIENCE_S = 5.0
-
-
-@pytest.fixture
-def clock() -> Iterator[SystemClock]:
-    clock = SystemClock()
-    yield clock
-    clock.close()
-    clock.check()
-
-
-@pytest.fixture
-def medium(clock: SystemClock) -> Iterator[Medium]:
-    medium = shared_medium("slcan:busy", clock=clock, bitrate=500_000, seed=1)
-    yield medium
-    forget_medium(medium.name, medium)
-
-
-def wait_until(clock: SystemClock, condition: Callable[[], bool]) -> None:
-    for _ in range(round(PATIENCE_S / 0.002)):
-        if condition():
-            return
-        clock.sleep(0.002)
-    raise AssertionError("it did not happen")
 
 
 def serve(medium: Medium, folder: Path) -> Endpoint:
