@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Literal
 
 import msgspec
 
 from microdrivers.core.units import Range
-
-if TYPE_CHECKING:
-    from microdrivers.devices.stage import Stage
 
 MotionKind = Literal["move", "retraction", "reference"]
 
@@ -36,20 +33,3 @@ class MotionPlan(msgspec.Struct, frozen=True, kw_only=True):
     def end(self) -> Mapping[str, float]:
         """Where the stage is afterwards, all axes."""
         return {**self.start, **self.targets}
-
-
-class MotionRule(Protocol):
-    """A rule of the rig for a stage's motion, asked before anything moves."""
-
-    def check(self, stage: Stage[Any], plan: MotionPlan) -> None:
-        """Let the motion pass.
-
-        Raises:
-            UnsafeError: the rule forbids it.
-        """
-
-    def free_share(self, stage: Stage[Any], plan: MotionPlan) -> float:
-        """How much of the way from the start is allowed, 0 to 1."""
-
-    def found_references(self, stage: Stage[Any]) -> None:
-        """A search for references has succeeded; the stage is where the drives have left it."""

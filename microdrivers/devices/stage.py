@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
@@ -14,7 +14,7 @@ from microdrivers.core.samples import PoseSample
 from microdrivers.core.units import Range, check_range, seconds_to_ns
 from microdrivers.devices.base import Device
 from microdrivers.devices.motion import AxisSpec, Move, MoveSlot, StopNote, move_duration_s
-from microdrivers.devices.motion_plan import MotionKind, MotionPlan, MotionRule
+from microdrivers.devices.motion_plan import MotionKind, MotionPlan
 
 MOVE_MARGIN_S = 0.5
 _RECENT_AT_REST_S = 0.1
@@ -23,6 +23,23 @@ _RECENT_IN_MOTION_S = 0.03
 _SLOWEST_UM_S = 1e-3
 
 PoseT = TypeVar("PoseT", bound=PoseSample)
+
+
+class MotionRule(Protocol):
+    """A rule of the rig for a stage's motion, asked before anything moves."""
+
+    def check(self, stage: Stage[Any], plan: MotionPlan) -> None:
+        """Let the motion pass.
+
+        Raises:
+            UnsafeError: the rule forbids it.
+        """
+
+    def free_share(self, stage: Stage[Any], plan: MotionPlan) -> float:
+        """How much of the way from the start is allowed, 0 to 1."""
+
+    def found_references(self, stage: Stage[Any]) -> None:
+        """A search for references has succeeded; the stage is where the drives have left it."""
 
 
 class Stage(Device[PoseT]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from microdrivers.core.errors import ConfigError
 from microdrivers.devices.base import Device
@@ -18,11 +18,9 @@ from microdrivers.devices.xytheta_stage import XYThetaStage
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig.safety_geometry import depth_um, distance_um
 from microdrivers.rig.safety_keep_out import MARGIN_UM
+from microdrivers.rig.sections import DeviceEntry, RigFile
 from microdrivers.rig.validation import suggest
 from microdrivers.rig.yaml_file import Document, Location
-
-if TYPE_CHECKING:
-    from microdrivers.rig.rig_file import DeviceEntry, RigFile
 
 _ROLES: Mapping[str, Mapping[str, type[Device[Any]]]] = {
     "microscope": {"sample_stage": XYThetaStage, "zoom": ZoomMotor, "camera": Camera},

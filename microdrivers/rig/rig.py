@@ -16,8 +16,9 @@ from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.errors import ConfigError, ConnectError, ErrorTree, MicrodriversError, UnsupportedError
 from microdrivers.devices.base import Device
 from microdrivers.recording.wire_log import WireLogWriter, describe_source
-from microdrivers.rig.rig_file import RigDescription, RigFile, load_rig_file
+from microdrivers.rig.rig_file import RigDescription, load_rig_file
 from microdrivers.rig.safety import Safety
+from microdrivers.rig.sections import RigFile
 from microdrivers.rig.simulation import Simulation
 
 DeviceT = TypeVar("DeviceT", bound=Device[Any])
