@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import errno
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-from microdrivers.core.clock import ClockError
+from microdrivers.core.clock import Clock, ClockError
 from microdrivers.core.errors import LinkError
 from microdrivers.core.units import NS_PER_S, seconds_to_ns
 from microdrivers.fakes.can.arrival import ERROR_FLAG, EXTENDED_FLAG, PROTOCOL_ERROR, REMOTE_FLAG, Arrival, Filter
 from microdrivers.fakes.can.frame import Frame, frame_shape
 from microdrivers.fakes.can.pacing import Pacer
 from microdrivers.fakes.can.timeline import NEVER_NS, BusTimeline
-
-if TYPE_CHECKING:
-    from microdrivers.fakes.can.medium import Medium
 
 TRANSMIT_QUEUE = 64
 """Frames that a port holds back for the bus; SocketCAN's default is 10, and 1000 is often set."""
@@ -41,6 +39,23 @@ class PortError(LinkError):
 _Received = tuple[int, int, Frame, bool, bool]
 
 
+class SharedMedium(Protocol):
+    """What a port needs of the bus that it is on; see `Medium`."""
+
+    bitrate: int
+    clock: Clock
+    lock: threading.RLock
+
+    def turn(self, t_ns: int | None = None) -> int:
+        """Let happen what is due."""
+
+    def next_event_ns(self) -> int:
+        """When something happens next."""
+
+    def forget(self, port: Port) -> None:
+        """A port leaves, and its frames with it."""
+
+
 class Port:
     """Sends in the order of its calls, as SocketCAN does, and receives what the others send.
 
@@ -55,7 +70,9 @@ class Port:
         transmit_errors: error counter: 8 up for each destroyed frame, 1 down for each other; bus-off at 256.
     """
 
-    def __init__(self, medium: Medium, timeline: BusTimeline, pacer: Pacer, *, bitrate: int, receive_own: bool) -> None:
+    def __init__(
+        self, medium: SharedMedium, timeline: BusTimeline, pacer: Pacer, *, bitrate: int, receive_own: bool
+    ) -> None:
         self.medium = medium
         self._timeline = timeline
         self._pacer = pacer

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from microdrivers.fakes.world.scene import normal_cdf
+from microdrivers.fakes.world.normal import normal_cdf
 
 Array = npt.NDArray[np.float64]
 Levels = npt.NDArray[np.float32]

@@ -12,8 +12,8 @@ from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.vision.template import take_template
 from microdrivers.fakes.world.embryo import TAIL_UM, Embryo
+from microdrivers.fakes.world.normal import normal_cdf
 from microdrivers.fakes.world.painting import Overlay, Rod
-from microdrivers.fakes.world.scene import normal_cdf
 from microdrivers.fakes.world.settings import SpecimenWorld
 from microdrivers.rig import build_rig
 from tests.fakes.specimen_bench import build, go, picture, probe_rig, ready, seen_px
