@@ -52,7 +52,8 @@ def _move(seed: int, speed_um_s: float) -> _Move:
         world: Any = rig.simulation.world
         truth = world.fine_stage_axes[STAGE]
         bring_home(stage, **_START_UM)
-        counts_per_um = rig.description.devices[STAGE].settings.axes.x.counts_per_um
+        settings: Any = rig.description.devices[STAGE].settings
+        counts_per_um = settings.axes.x.counts_per_um
         samples: list[FineStageSample] = []
         stage.topic.subscribe(samples.append)
         began_ns = rig.clock.now_ns()

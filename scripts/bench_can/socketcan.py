@@ -18,9 +18,9 @@ import numpy as np
 from bench_wires.figures import Figure
 
 from bench_can.tools import SENSOR, STAGE, bring_home, judge, part_of_workstation
+from microdrivers.backends.cia402.fine_stage import Cia402FineStage
 from microdrivers.backends.lines.can_line import shared_can_line
 from microdrivers.core.samples import Sample
-from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.fakes.can import medium_named
 from microdrivers.fakes.can.medium import Medium
@@ -62,12 +62,12 @@ def _measure_here(seconds: float) -> list[Figure]:
             medium = medium_named(f"socketcan:{settings[STAGE].connection.channel}")
             assert medium is not None
             with build_rig(pointing) as rig:
-                bring_home(rig.device(STAGE, FineStage))
+                bring_home(rig.device(STAGE, Cia402FineStage))
                 return [*_poses(rig, medium, seconds), *_forces(rig, medium, settings[SENSOR].node_id, seconds)]
 
 
 def _poses(rig: Rig, medium: Medium, seconds: float) -> list[Figure]:
-    stage = rig.device(STAGE, FineStage)
+    stage = rig.device(STAGE, Cia402FineStage)
     settings: Any = rig.description.devices[STAGE].settings
     line = shared_can_line(settings.connection, clock=rig.clock)
     samples, stamps_ns = list[Sample](), list[int]()

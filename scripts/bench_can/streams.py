@@ -12,10 +12,10 @@ from typing import Any
 from bench_wires.figures import Figure
 
 from bench_can.tools import SENSOR, STAGE, bring_home, judge, simulated
+from microdrivers.backends.cia402.fine_stage import Cia402FineStage
+from microdrivers.backends.cia404.sensor import Cia404ForceSensor
 from microdrivers.core.samples import Sample
 from microdrivers.core.units import NS_PER_S
-from microdrivers.devices.fine_stage import FineStage
-from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.fakes.can import medium_named
 
 _POSE_HZ, _FORCE_HZ = 100.0, 1000.0
@@ -27,7 +27,7 @@ def measure(repeat: float) -> list[Figure]:
     """Both streams at once, while the stage moves to and fro; counted between two instants in mid-stream."""
     moves = max(2, round(_SECONDS * repeat))
     with simulated(STAGE, SENSOR, seed=1) as rig:
-        stage, sensor = rig.device(STAGE, FineStage), rig.device(SENSOR, ForceSensor)
+        stage, sensor = rig.device(STAGE, Cia402FineStage), rig.device(SENSOR, Cia404ForceSensor)
         bring_home(stage)
         settings: Any = {name: rig.description.devices[name].settings for name in (STAGE, SENSOR)}
         medium = medium_named(f"socketcan:{settings[STAGE].connection.channel}")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bench_force.runs import DEFORMATION_UM, FORCE_UN, Array
+from microdrivers.estimators.force.prepared import Indices
 
 _STEP = 1e-4
 _OF_THE_MOTION = ("start_um", "depth_um", "speed_um_s", "back_um_s", "sensor_uN_per_um")
@@ -23,7 +24,7 @@ _OF_THE_SPECIMEN = {
 }
 
 
-def cramer_rao(indenter: ModuleType, preset: str, push: Any, used: Array) -> Array:
+def cramer_rao(indenter: ModuleType, preset: str, push: Any, used: Indices) -> Array:
     """Least standard deviations of the specimen's parameters.
 
     Args:
