@@ -48,10 +48,10 @@ def move(choice: RigChoice, device: str, relative: bool, retract: bool, **option
       microdrivers move lab.yaml probe_stage --z-um 250 --speed-um-s 50
       microdrivers move lab.yaml probe_stage --retract
     """
+    from microdrivers.cli.standstill import says_where_it_stopped
     from microdrivers.core.errors import NotReferenced
     from microdrivers.devices.stage import Stage
     from microdrivers.devices.zoom_motor import ZoomMotor
-    from microdrivers.routines.device_state import state_text
 
     given = {name: value for name, value in options.items() if value is not None}
     with closing(choice.build()) as rig:
@@ -59,15 +59,15 @@ def move(choice: RigChoice, device: str, relative: bool, retract: bool, **option
         _check_options(stage_or_zoom, given, retract)
         stage_or_zoom.open()
         try:
-            if isinstance(stage_or_zoom, ZoomMotor):
-                zoom = given["zoom"] + (stage_or_zoom.read().zoom if relative else 0.0)
-                click.echo(f"{device}: {state_text(stage_or_zoom, stage_or_zoom.move_to(zoom=zoom))}")
-            else:
+            with says_where_it_stopped(stage_or_zoom, choice.file):
+                if isinstance(stage_or_zoom, ZoomMotor):
+                    _move_zoom(stage_or_zoom, given["zoom"], relative)
+                    return
                 _reference_emulated(rig, stage_or_zoom, given)
                 if retract:
                     _retract(rig, stage_or_zoom)
                 else:
-                    click.echo(f"{device}: {_move_stage(stage_or_zoom, given, relative)}")
+                    _move_stage(stage_or_zoom, given, relative)
         except NotReferenced as error:
             error.remedy = f"make sure that the way is free, then: {_reference_command(choice, stage_or_zoom, given)}"
             raise
@@ -119,7 +119,14 @@ def _reference_emulated(rig: Rig, stage: Stage[Any], given: dict[str, float]) ->
         stage.reference(unknown)
 
 
-def _move_stage(stage: Stage[Any], given: dict[str, float], relative: bool) -> str:
+def _move_zoom(motor: ZoomMotor, zoom: float, relative: bool) -> None:
+    from microdrivers.routines.device_state import state_text
+
+    sample = motor.move_to(zoom=zoom + (motor.read().zoom if relative else 0.0))
+    click.echo(f"{motor.name}: {state_text(motor, sample)}")
+
+
+def _move_stage(stage: Stage[Any], given: dict[str, float], relative: bool) -> None:
     from microdrivers.routines.device_state import state_text
 
     moving: Any = stage  # which keywords its own move takes has been checked
@@ -129,7 +136,7 @@ def _move_stage(stage: Stage[Any], given: dict[str, float], relative: bool) -> s
         pose = moving.move_to(**given)
     here, goal = pose.position, pose.target
     misses = [f"{axis} {here[axis] - goal[axis]:+.3g} {stage.axes[axis].unit}" for axis in _axes(given)]
-    return f"{state_text(stage, pose)}; off target by {', '.join(misses)}"
+    click.echo(f"{stage.name}: {state_text(stage, pose)}; off target by {', '.join(misses)}")
 
 
 def _retract(rig: Rig, stage: FineStage) -> None:

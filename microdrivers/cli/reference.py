@@ -39,6 +39,7 @@ def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool
       microdrivers reference lab.yaml --device probe_stage
       microdrivers reference lab.yaml --device zoom
     """
+    from microdrivers.cli.standstill import says_where_it_stopped
     from microdrivers.devices.zoom_motor import ZoomMotor
     from microdrivers.routines.device_state import state_text
 
@@ -52,10 +53,11 @@ def reference(choice: RigChoice, axes: str | None, device: str | None, yes: bool
             click.confirm(question, abort=True, err=True)
         progress = TerminalProgress()
         found.events.subscribe(lambda event: _show(event, progress))
-        if isinstance(found, ZoomMotor):
-            found.reference()
-        else:
-            found.reference(names)
+        with says_where_it_stopped(found, choice.file):
+            if isinstance(found, ZoomMotor):
+                found.reference()
+            else:
+                found.reference(names)
         what = f"{', '.join(names)} referenced" if names else "reference found"
         click.echo(f"{found.name}: {what}; now at {state_text(found, found.read())}")
         trapped = None if isinstance(found, ZoomMotor) else rig.safety.trapped(found)

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from microdrivers.devices.base import Device
     from microdrivers.rig import Rig
 
-_STANDSTILL_S = 2.0
-_POLL_S = 0.05
-
 
 class _Told(NamedTuple):
     """What became of one device: whether the stop was sent, and what went wrong before it or after."""
@@ -46,6 +43,7 @@ def stop(choice: RigChoice) -> None:
     Example:
       microdrivers stop lab.yaml
     """
+    from microdrivers.cli.standstill import watch_standstill
     from microdrivers.devices.camera import Camera
     from microdrivers.devices.force_sensor import ForceSensor
 
@@ -56,7 +54,7 @@ def stop(choice: RigChoice) -> None:
         width = max(map(len, rig.devices))
         failed = False
         for device, sent, error in told:
-            text, bad = _watch(device) if error is None else (_failed(sent, error), True)
+            text, bad = watch_standstill(device, choice.file) if error is None else (_failed(sent, error), True)
             failed |= bad
             click.echo(f"{device.name:<{width}}  {text}")
     if failed:
@@ -112,22 +110,3 @@ def _failed(sent: bool, error: MicrodriversError) -> str:
     first = "    to do: another program may hold the port, interrupt that program"
     remedy = f"; else {error.remedy}" if error.remedy else ""
     return f"{click.style(outcome, fg='red', bold=True)}: {error.what}\n{first}{remedy}"
-
-
-def _watch(device: Device[Any]) -> tuple[str, bool]:
-    """What is seen of a device that was told to stop, and whether that is bad."""
-    from microdrivers.core.errors import MicrodriversError
-    from microdrivers.core.units import seconds_to_ns
-    from microdrivers.routines.device_state import state_text
-
-    deadline_ns = device.clock.now_ns() + seconds_to_ns(_STANDSTILL_S)
-    try:
-        sample = device.read()
-        while getattr(sample, "moving", False) and device.clock.now_ns() < deadline_ns:
-            device.clock.sleep(_POLL_S)
-            sample = device.read()
-    except MicrodriversError as error:
-        return f"told to stop; whether it stands still is not known: {error.what}", True
-    still_moving = bool(getattr(sample, "moving", False))
-    but = f", but {click.style('STILL MOVING', fg='red', bold=True)}" if still_moving else ""
-    return f"told to stop{but}: {state_text(device, sample)}", still_moving

@@ -26,6 +26,13 @@ def test_stop_stops_although_the_wire_log_cannot_be_written(run, prepared, tmp_p
     assert (tmp_path / "wire.jsonl").read_text(encoding="utf-8") == "evidence"
 
 
+def test_stop_names_a_fault_and_the_command_that_clears_it(run, prepared):
+    prepared(alarmed)
+    result = run("stop", RIG, "--fake")
+    assert re.search(r"zoom\s+told to stop: .*; FAULT: alarm 30h is on: overload", result.stdout)
+    assert f"microdrivers clear-fault {RIG} zoom" in result.stdout
+
+
 def test_stop_names_another_program_first(run):
     result = run("stop", RIG)
     assert result.stdout.count("to do: another program may hold the port") == 2

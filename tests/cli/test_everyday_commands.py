@@ -160,6 +160,9 @@ def test_ctrl_c_during_a_move_stops_the_stage(run, prepared, monkeypatch):
     monkeypatch.setattr(Wire, "write", interrupting)
     result = run("move", RIG, "sample_stage", "--x-um", 12_000, "--fake")
     assert result.exit_code == 130
+    said = re.search(r"sample_stage: told to stop: x (\d+\.\d+) µm, .*; at rest", result.stderr)
+    assert said, result.stderr
+    assert 7500 < float(said[1]) < 11_000
     texts = [text for _, text in emulators[0].events]
     moved = next(number for number, text in enumerate(texts) if text.startswith("move x"))
     assert "stop #24" in texts[moved:]
