@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import importlib
+import inspect
 import math
 from collections.abc import Collection, Mapping
 from typing import Any, Literal
@@ -84,6 +86,15 @@ class CanConnection(DeviceSettings):
         return options
 
     @pydantic.model_validator(mode="after")
+    def _spelt_as_the_interface_does(self) -> CanConnection:
+        known = _options_of(self.interface) if self.options else ()
+        for key in self.options:
+            close = difflib.get_close_matches(key, known, n=1, cutoff=_A_SLIP)
+            if key not in known and close:
+                raise ValueError(f"options.{key} is unknown to {self.interface}; did you mean {close[0]!r}?")
+        return self
+
+    @pydantic.model_validator(mode="after")
     def _channel_of_the_interface(self) -> CanConnection:
         channel = self.channel
         if self.interface == "slcan" and "/" not in channel and not channel.upper().startswith("COM"):
@@ -110,6 +121,10 @@ class CanConnection(DeviceSettings):
 _LONGEST_NAME = 15
 """Of a Linux network interface (IFNAMSIZ), in characters."""
 
+_A_SLIP = 0.8
+"""Likeness of two words that are meant to be one: python-can has options (data_bitrate) that no class names."""
+
+_NO_OPTIONS = frozenset({"self", "args", "kwargs"})
 _ALIKE = ("interface", "channel", "bitrate", "options")
 
 
@@ -120,3 +135,15 @@ def _interfaces() -> Collection[str]:
     except ModuleNotFoundError:
         return ()
     return VALID_INTERFACES
+
+
+def _options_of(interface: str) -> Collection[str]:
+    """What python-can's class for this interface names; it takes more, and ignores what it does not know."""
+    try:
+        from can.interfaces import BACKENDS
+
+        module, name = BACKENDS[interface]
+        kind = getattr(importlib.import_module(module), name)
+    except (ImportError, OSError, KeyError):  # of a plug-in, or without its driver, which opening says
+        return ()
+    return {key for base in kind.__mro__ for key in inspect.signature(base.__init__).parameters} - _NO_OPTIONS

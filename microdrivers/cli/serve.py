@@ -22,6 +22,7 @@ _SWITCH_S = 0.0005
 """How long a thread may compute while others wait for their turn: Python's 5 ms, times all that draw pictures, are
 longer than a bus may stand still."""
 _ADAPTER = "slcan"
+_HEADER = ("device", "where other programs reach it")
 
 
 def _finite(_context: click.Context, _parameter: click.Parameter, value: float | None) -> float | None:
@@ -126,7 +127,8 @@ def _announce(running: ServedRig, served: Path | None, duration_s: float | None,
     if as_json:
         click.echo(json.dumps(where))
         return
-    width = max(map(len, where))
+    width = max(map(len, (_HEADER[0], *where)))
+    click.echo(f"{_HEADER[0]:<{width}}  {_HEADER[1]}")
     for name, place in where.items():
         click.echo(f"{name:<{width}}  {place}")
     for line in _adapters(running):

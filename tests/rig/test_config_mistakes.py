@@ -57,6 +57,10 @@ MISTAKES = {
         BUS, BUS[:-1] + ", options: {fd: yes}}", f"{PROBE}.connection.options.fd", "fd is 'yes'",
         "write true for CAN FD",
     ),
+    "misspelt option": (
+        BUS, BUS[:-1] + ", options: {local_lopback: true}}", f"{PROBE}.connection.options.local_lopback",
+        "unknown to socketcan", "did you mean 'local_loopback'?",
+    ),
     "bit rate among the options": (
         BUS, BUS[:-1] + ", options: {bitrate: 500000}}", f"{PROBE}.connection.options.bitrate", "not python-can's",
         "beside options",
