@@ -45,15 +45,17 @@ _log = logging.getLogger(__name__)
 def identify_all(drives: Sequence[Drive], *, device: str) -> list[Identity]:
     """Ask all drives of a device, so that all that are missing can be named at once; errors as `identify`."""
     found: list[Identity] = []
-    silent: list[LinkTimeout] = []
+    silent: dict[str, LinkTimeout] = {}
     for drive in drives:
         try:
             found.append(identify(drive, key=f"{device}.axes.{drive.axis}"))
         except LinkTimeout as error:
-            silent.append(error)
+            silent[drive.name] = error
     if silent:
-        silent[0].what = "; ".join(error.what for error in silent)
-        raise silent[0]
+        last = list(silent.values())[-1]  # by then, the line knows most of what may be to blame
+        if len(silent) > 1:
+            last.what = f"{', '.join(silent)} do not answer; the last of them: {last.what}"
+        raise last
     return found
 
 
