@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from microdrivers.cli.main import EXIT_ERROR
+from microdrivers.cli.exit_codes import EXIT_ERROR
 from microdrivers.cli.progress import TerminalProgress
 from microdrivers.cli.rig_options import RigChoice, rig_options
 

@@ -21,6 +21,7 @@ class MotionPlan(msgspec.Struct, frozen=True, kw_only=True):
         targets: of the axes that are to move; empty for a search.
         sweep: the interval in which each axis stays until the motion has ended; empty for a search.
         straight: it begins at rest and the axes arrive together, so that the way is the line from start to targets.
+        speed_um_s: along the way of the linear axes; 0 if it is not this command's to choose.
     """
 
     kind: MotionKind
@@ -28,6 +29,7 @@ class MotionPlan(msgspec.Struct, frozen=True, kw_only=True):
     targets: Mapping[str, float]
     sweep: Mapping[str, Range]
     straight: bool
+    speed_um_s: float = 0.0
 
     @property
     def end(self) -> Mapping[str, float]:

@@ -269,7 +269,10 @@ class Stage(Device[PoseT]):
             aside = now * _RECENT_IN_MOTION_S + now * now / (2.0 * spec.acceleration)
             sweep[axis] = Range(min(start[axis] - aside, goal), max(start[axis] + aside, goal))
             fastest[axis] = min(speed, spec.max_speed)
-        plan = MotionPlan(kind=kind, start=start, targets=targets, sweep=sweep, straight=not pose.moving)
+        plan = MotionPlan(
+            kind=kind, start=start, targets=targets, sweep=sweep, straight=not pose.moving,
+            speed_um_s=math.hypot(*(speed for axis, speed in speeds.items() if self.axes[axis].unit == "µm")),
+        )  # fmt: skip
         return plan, fastest
 
     def _recent_pose(self) -> PoseT:

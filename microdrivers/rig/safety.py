@@ -68,6 +68,11 @@ class Safety:
         guard = self.guards.get(sensor)
         return None if guard is None else guard.settings.max_force_uN
 
+    def max_speed_um_s(self, sensor: str) -> float:
+        """The largest speed that a sensor's guard allows its stage; infinite if it states none."""
+        guard = self.guards.get(sensor)
+        return math.inf if guard is None else guard.settings.max_speed_um_s or math.inf
+
     @property
     def tripped(self) -> Mapping[str, str]:
         """By sensor, why its guard has tripped, of those that have and are not over it."""

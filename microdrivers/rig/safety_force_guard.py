@@ -25,6 +25,9 @@ BY = "force guard"
 
 LIMIT_RULE, DATA_RULE, TARE_RULE, RETRACTION_RULE = "force limit", "force data", "tare", "retraction"
 
+_ROUNDING = 1.001
+"""Of a largest speed: what its axes' shares may add up to."""
+
 _BELOW_SHARE = 0.95
 """Of the limit: a trip is over below it, so that noise at the limit is not a trip a reading."""
 
@@ -110,13 +113,19 @@ class ForceGuard:
         """Let the guarded stage begin to move, or to search its references.
 
         Raises:
-            UnsafeError: no valid, fresh force data come.
+            UnsafeError: no valid, fresh force data come, or the move is faster than this guard allows.
         """
         if plan.kind == "retraction":
             self._braking_until_ns = self._clock.now_ns()
             if not plan.straight:
                 self._braking_until_ns += seconds_to_ns(self._the_stage().braking_s)
             return
+        fastest_um_s = self.settings.max_speed_um_s
+        if fastest_um_s is not None and plan.speed_um_s > _ROUNDING * fastest_um_s:
+            raise UnsafeError(
+                f"refused by the {BY}: {plan.speed_um_s:g} µm/s are faster than its max_speed_um_s, {fastest_um_s:g}",
+                remedy=f"give a speed of at most {fastest_um_s:g} µm/s, or change the rig file's safety section",
+            )
         self._flow.require(self.settings.stage)
         self._armed = self._allowed = True
         self._blind = False

@@ -54,7 +54,8 @@ class ForceGuardSettings(DeviceSettings):
 
     `stage` carries the sensor and is stopped and retracted when the force is larger than `max_force_uN`, of either
     sign. It moves only while force data come that are not older than `stale_after_ms`. A tare beyond ±`zero_within_uN`
-    counts as load: so far may the amplifier's own zero be off; by default 10 % of the limit.
+    counts as load: so far may the amplifier's own zero be off; by default 10 % of the limit. Moves faster than
+    `max_speed_um_s` are refused: until it stands, a stage goes on by what it does in a reading and while it brakes.
     """
 
     sensor: str
@@ -62,6 +63,7 @@ class ForceGuardSettings(DeviceSettings):
     max_force_uN: float = pydantic.Field(gt=0)
     stale_after_ms: float = pydantic.Field(default=50.0, ge=2.0, le=1000.0)
     zero_within_uN: float | None = pydantic.Field(default=None, ge=0)
+    max_speed_um_s: float | None = pydantic.Field(default=None, gt=0)
 
     @property
     def zero_uN(self) -> float:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Sequence
 
 from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.units import NS_PER_MS
 from microdrivers.devices.fine_stage import FineStage
+from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.rig import Rig
 from microdrivers.rig.safety_force_guard import ForceGuard
 from microdrivers.routines.findings import DeviceDiagnosis
@@ -26,7 +28,9 @@ def check_guards(rig: Rig, diagnoses: Sequence[DeviceDiagnosis]) -> None:
     for guard in rig.safety.guards.values():
         sensor, stage = found.get(guard.settings.sensor), rig.devices.get(guard.settings.stage)
         if sensor is not None and isinstance(stage, FineStage):
-            _check_guard(guard, stage, sensor)
+            force = rig.devices[guard.settings.sensor]
+            rate_hz = force.stream_rate_hz if isinstance(force, ForceSensor) else math.inf
+            _check_guard(guard, stage, rate_hz, sensor)
     for name, device in rig.devices.items():
         if isinstance(device, FineStage) and device.link == "open" and name in found:
             boxes = rig.safety.keep_out.reachable(device)
@@ -34,8 +38,8 @@ def check_guards(rig: Rig, diagnoses: Sequence[DeviceDiagnosis]) -> None:
                 found[name].ok(f"its tip could reach and is kept out of: {', '.join(boxes)}")
 
 
-def _check_guard(guard: ForceGuard, stage: FineStage, found: DeviceDiagnosis) -> None:
-    what = f"its guard stops {stage.name} beyond {guard.settings.max_force_uN:g} µN"
+def _check_guard(guard: ForceGuard, stage: FineStage, rate_hz: float, found: DeviceDiagnosis) -> None:
+    what = f"its guard stops {stage.name} beyond {guard.settings.max_force_uN:g} µN; {_goes_on(guard, stage, rate_hz)}"
     try:
         took_ms = _rehearsed_ms(guard, stage)
     except MicrodriversError as error:
@@ -54,6 +58,16 @@ def _check_guard(guard: ForceGuard, stage: FineStage, found: DeviceDiagnosis) ->
         f"{what}: from reading to stop command {median_ms:.2f} ms, {worst_ms:.2f} ms at worst of {REHEARSALS}",
         "let nothing else load this computer, and give the tools a bus of their own",
     )
+
+
+def _goes_on(guard: ForceGuard, stage: FineStage, rate_hz: float) -> str:
+    """How far the tool goes on after the reading that stops it: a period of the readings, and braking."""
+    stated = guard.settings.max_speed_um_s
+    speed_um_s = max(stage.max_speed.values()) if stated is None else stated
+    weakest_um_s2 = min(axis.acceleration for axis in stage.axes.values())
+    way_um = speed_um_s / rate_hz + speed_um_s**2 / (2.0 * weakest_um_s2)
+    whose = "its max_speed_um_s" if stated is not None else "as no max_speed_um_s is stated"
+    return f"at {speed_um_s:g} µm/s, {whose}, it goes on for {way_um:.2g} µm"
 
 
 def _rehearsed_ms(guard: ForceGuard, stage: FineStage) -> list[float]:

@@ -31,6 +31,19 @@ def guarded(tmp_path):
         yield rig
 
 
+def test_a_move_faster_than_the_guard_allows_is_refused_and_a_retraction_is_not(tmp_path):
+    guard = {"sensor": SENSOR, "stage": STAGE, "max_force_uN": LIMIT_UN, "max_speed_um_s": 50.0}
+    with guarded_rig(tmp_path, safety={"force_guards": [guard], "keep_out": "none"}) as guarded:
+        guarded.stage.move_to(x_um=3.0, y_um=4.0, speed_um_s=50.0)
+        for speed_um_s in (51.0, None):
+            with pytest.raises(UnsafeError, match="faster than its max_speed_um_s, 50") as refused:
+                guarded.stage.move_to(x_um=0.0, speed_um_s=speed_um_s)
+            assert "at most 50 µm/s" in refused.value.remedy
+        assert guarded.true_x_um() == pytest.approx(3.0, abs=0.1)
+        guarded.stage.retract().wait()
+        assert guarded.true_x_um() > 300.0
+
+
 # ---------------------------------------------------------------------- too much force
 
 

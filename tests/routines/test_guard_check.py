@@ -33,13 +33,24 @@ def test_each_guard_is_rehearsed_at_rest_and_boxes_within_reach_are_named(guarde
     found = findings(guarded)
     ((level, what),), _ = found[SENSOR]
     assert level == "ok"
-    assert "its guard stops probe_stage beyond 1000 µN" in what
+    assert "its guard stops probe_stage beyond 1000 µN; at " in what
+    assert "as no max_speed_um_s is stated, it goes on for " in what
     assert found[STAGE][0] == [("ok", "its tip could reach and is kept out of: slide")]
     assert [event.by for event in guarded.stops()] == ["force guard"] * REHEARSALS
     assert guarded.rules() == []
     assert not guarded.rig.safety.tripped
     assert guarded.true_x_um() == 0.0
     guarded.stage.move_to(x_um=10.0)
+
+
+def test_the_way_on_is_that_of_the_largest_speed_allowed(tmp_path):
+    guard = SAFETY["force_guards"][0] | {"max_speed_um_s": 100.0}
+    with guarded_rig(tmp_path, clock=SimulatedClock(), safety=SAFETY | {"force_guards": [guard]}) as guarded:
+        guarded.stage.read()
+        ((_, what),), _ = findings(guarded)[SENSOR]
+        acceleration = min(axis.acceleration for axis in guarded.stage.axes.values())
+    way_um = 100.0 / 200.0 + 100.0**2 / (2.0 * acceleration)
+    assert f"at 100 µm/s, its max_speed_um_s, it goes on for {way_um:.2g} µm" in what
 
 
 def test_a_stage_in_motion_is_not_stopped_for_a_rehearsal(guarded):
