@@ -199,7 +199,7 @@ def _meeting(time_s: Array, deformation: Array, first: int, end: int, begin: int
 def _holds(time_s: Array, deformation: Array, first: int, turn: int) -> bool:
     """The record ends in a hold: after its only reversal the deformation stays within a fifth of the depth."""
     depth = float(deformation[turn - 1] - deformation[first])
-    return bool(np.median(deformation[turn:]) > deformation[turn - 1] - 0.2 * depth and len(time_s) - turn > 0
+    return bool(len(time_s) > turn and np.median(deformation[turn:]) > deformation[turn - 1] - 0.2 * depth
                 and deformation[-3:].mean() > deformation[turn - 1] - 0.1 * depth)  # fmt: skip
 
 

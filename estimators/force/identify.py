@@ -8,12 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from microdrivers.core.errors import IllConditioned
 from microdrivers.estimators.force.branches import Branches
 from microdrivers.estimators.force.fit_motion import motion_everywhere
-from microdrivers.estimators.force.joint import BASE, Motion, force_of, slopes_of
+from microdrivers.estimators.force.joint import BASE, Motion, force_of, motion_of, slopes_of
 from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.outliers import named_outliers
 from microdrivers.estimators.force.plausibility import doubts
-from microdrivers.estimators.force.prepared import LOADING, Indices, Prepared, SeenBefore
+from microdrivers.estimators.force.prepared import LOADING, UNLOADING, Indices, Prepared, SeenBefore
 from microdrivers.estimators.force.protocol_fit import (
     ProtocolFit,
     named_parameters,
@@ -35,9 +37,11 @@ class IdentificationSettings(NamedTuple):
 
     Attributes:
         around_reversal: samples left out on either side of contact, reversals and release.
+        protocol: which one's model counts; None: the one that explains the record best.
     """
 
     around_reversal: int = 2
+    protocol: ProtocolName | None = None
 
 
 class Contact(NamedTuple):
@@ -63,7 +67,7 @@ class Slip(NamedTuple):
         offset_um, rate_per_s: offset and α, each followed by its standard deviation.
         not_returned_um: deformation that was left when contact was lost; None if it was not lost.
         identifiable: the record determines offset and α, no other protocol explains it as well, and this one leaves
-            nothing but noise.
+            nothing but noise. reason: why not; empty if it is.
     """
 
     offset_um: float
@@ -72,6 +76,7 @@ class Slip(NamedTuple):
     sigma_rate_per_s: float
     not_returned_um: float | None
     identifiable: bool
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,8 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
         settings: how; the usual if None.
 
     Raises:
-        DataError: the record cannot be used; see `record.check`. NoContact: it shows no contact.
+        DataError: the record cannot be used; see `record.check`. NoContact: it shows no contact. IllConditioned: it
+            does not allow the protocol that is asked for.
     """
     settings = settings or IdentificationSettings()
     check(record)
@@ -122,6 +128,11 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     fits = all_protocols(prepared, on_ramps)
     protocols = {name: _protocol_fit(prepared, name, fit) for name, fit in fits.items()}
     best = _best(protocols)
+    slip = _slip(prepared, protocols.get("slip_corrected"), best)
+    notes = _notes(record, prepared, both_ways="single" in protocols)
+    if settings.protocol not in {None, best}:
+        notes.append(f"{settings.protocol} was asked for; {best} would be preferred")
+        best = _asked_for(settings.protocol, protocols)
     chosen = protocols[best]
     end_s = prepared.branches.release_s or float(prepared.time_s[-1])
     return Identification(
@@ -134,7 +145,7 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
             chosen.sigma_contact_time_s,
             prepared.contact.seen,
         ),
-        slip=_slip(prepared, protocols.get("slip_corrected"), best == "slip_corrected"),
+        slip=slip,
         branches=prepared.branches,
         excluded_samples=prepared.excluded,
         misfit=chosen.misfit,
@@ -142,7 +153,7 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
         deformation_sigma_um=prepared.deformation_sigma_um,
         force_sigma_uN=prepared.force_sigma_uN,
         knots_s=fits[best].spacing_s,
-        notes=tuple(_notes(record, prepared, both_ways="single" in protocols)),
+        notes=tuple(notes),
     )
 
 
@@ -165,6 +176,7 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
 
     misfit, structure = test(judged), test(fitted_to)
     ratio = _noise_ratio(left[fitted_to], noise[fitted_to])
+    beyond = "its residual has structure" if fit.within_noise else f"{ratio:.3g} × noise"
     weak = weak_parameters(
         prepared,
         fit.theta,
@@ -172,7 +184,7 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
         Motion(*(part[fitted_to] for part in motion)),
         slips=slips,
         structured_uN=structure.structured_uN if structure.found else 0.0,
-        noise_ratio=ratio if structure.found and not fit.within_noise else None,
+        misfit=f"the model does not explain the record: {beyond}" if structure.found else "",
     )
     names = ["k1", "k2", "b", "m", *(["slip", "slip_rate"] if slips else [])]
     return ProtocolFit(
@@ -190,10 +202,20 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
         within_noise=fit.within_noise,
         misfit=misfit,
         deepest_um=float(np.max(motion.compression_um)),
-        fastest_um_s=float(np.max(np.abs(motion.velocity_um_s))),
+        **_fastest(prepared, fit, motion),
         likelihood_cost=solution.cost + fit.parameters * float(np.log(2 * solution.samples)),
         **named_parameters(fit.theta, fit.covariance),
     )
+
+
+def _fastest(prepared: Prepared, fit: Fit, motion: Motion) -> dict[str, float]:
+    """Largest speed while loading and while unloading, of the contact point or, where that is faster, of x."""
+    none = np.zeros(len(prepared.used))
+    slipping_um_s = -motion_of(fit.theta, prepared.time_s[prepared.used], none, none, none).velocity_um_s
+    speeds = np.stack([motion.velocity_um_s, motion.velocity_um_s + slipping_um_s])
+    in_um_s = float(np.max(speeds[:, prepared.branch == LOADING]))
+    out = -speeds[:, prepared.branch == UNLOADING]
+    return {"fastest_um_s": in_um_s, "fastest_unloading_um_s": float(np.max(out)) if out.size else in_um_s}
 
 
 def _percent(left: Array, force: Array) -> float:
@@ -240,24 +262,38 @@ def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
     return next(name for name in names if protocols[name].error_percent <= _SIMPLER * least)
 
 
-def _slip(prepared: Prepared, fit: ProtocolFit | None, is_best: bool) -> Slip | None:
+def _asked_for(name: ProtocolName | None, protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
+    if name is None or name not in protocols:
+        raise IllConditioned(
+            f"the record does not allow the protocol {name}", remedy=f"ask for one of {', '.join(protocols)}"
+        )
+    return name
+
+
+def _slip(prepared: Prepared, fit: ProtocolFit | None, best: ProtocolName) -> Slip | None:
     if fit is None:
         return None
     last = prepared.branches.unloading.stop
     lost = prepared.branches.release_s is not None
     left = float(np.mean(prepared.deformation_um[max(last - 2, 0) : last])) - fit.contact_um
+    why = list(dict.fromkeys(fit.weak[name] for name in ("slip", "slip_rate") if name in fit.weak))
+    if fit.misfit.found:
+        why.append("slip_corrected leaves more than noise")
+    if best != "slip_corrected":
+        why.append(f"{best} explains the record without a slip, as well or better")
     return Slip(
         fit.slip_um,
         fit.sigma_slip_um,
         fit.slip_rate_per_s,
         fit.sigma_slip_rate_per_s,
         left if lost else None,
-        is_best and not fit.misfit.found and fit.identifiable["slip"] and fit.identifiable["slip_rate"],
+        not why,
+        "; ".join(why),
     )
 
 
 def _notes(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) -> list[str]:
-    notes = doubts(prepared)
+    notes = [*doubts(prepared), *named_outliers(prepared)]
     for what, stated, used, unit in (
         ("deformation", record.deformation_sigma_um, prepared.deformation_sigma_um, "µm"),
         ("force", record.force_sigma_uN, prepared.force_sigma_uN, "µN"),
@@ -268,7 +304,7 @@ def _notes(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) ->
     if np.sum(pulled < -6.0 * prepared.force_sigma_uN) >= 3:
         notes.append(f"adhesion: the specimen pulls with up to {-pulled.min():.3g} µN, which the model does not have")
     if prepared.contact.seen == "nothing":
-        notes.append("the record begins in contact: the contact point is that of the record's own zero")
+        notes.append("the record begins in contact, or noise hides where: the contact point is that of its own zero")
     full = len(prepared.excluded.get("saturated", ()))
     if full:
         notes.append(f"the sensor was at the end of its range in {full} samples, which are left out")
@@ -276,7 +312,10 @@ def _notes(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) ->
     if parts.release_s is not None and parts.turns_s and parts.release_s < parts.turns_s[0]:
         notes.append(f"contact was lost at {parts.release_s:.2f} s, while the deformation still grew")
     if not len(parts.unloading):
-        notes.append("the record has no unloading: only the loading is fitted")
+        why = "the record has no unloading"
+        if parts.release_s is not None:
+            why = "no force above its noise was left once the tip had turned"
+        notes.append(f"{why}: only the loading is fitted")
     elif not both_ways:
         notes.append("the tip left the specimen soon after it turned back: only the loading is fitted")
     elif parts.release_s is None:

@@ -25,8 +25,9 @@ class SpecimenModel(NamedTuple):
         slip_rate_per_s: α of eq. (26).
         covariance: of (k1, k2, b_loading), row-major 3 × 3, in these units; empty if unknown.
         residual_uN: RMS of what the model left over when it was identified.
-        deepest_um: largest compression that was characterised.
-        fastest_um_s: largest speed of compression that was characterised, of either sign.
+        deepest_um: largest compression x that was characterised; with a slip, the deformation was deeper by that.
+        fastest_um_s, fastest_unloading_um_s: largest speeds that were characterised while the compression grows and
+            while it shrinks; both positive.
     """
 
     k1_uN_per_um: float
@@ -41,6 +42,7 @@ class SpecimenModel(NamedTuple):
     residual_uN: float = 0.0
     deepest_um: float = math.inf
     fastest_um_s: float = math.inf
+    fastest_unloading_um_s: float = math.inf
 
 
 def force_uN(

@@ -158,7 +158,8 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         number[part.start : part.stop] = index
     used = np.flatnonzero(free)
     loading = int(np.sum(number[used] == LOADING))
-    if loading < _FEWEST_IN_FIT and np.mean(full[branches.loading.start : branches.loading.stop]) > _MOSTLY:
+    in_loading = full[branches.loading.start : branches.loading.stop]
+    if loading < _FEWEST_IN_FIT and np.count_nonzero(in_loading) > _MOSTLY * len(in_loading):
         raise SaturatedData(
             f"the sensor is at the end of its range nearly throughout the loading, and {loading} samples are left",
             remedy="indent less deep or slower, or use a sensor with a wider range",

@@ -22,6 +22,7 @@ from microdrivers.estimators.force.joint import (
 from microdrivers.estimators.force.model import Array, SpecimenModel
 from microdrivers.estimators.force.prepared import Prepared
 from microdrivers.estimators.force.protocols import ProtocolName
+from microdrivers.estimators.force.record import CLEAR
 from microdrivers.estimators.force.structure import StructureTest
 
 INTERVAL = 1.96
@@ -31,6 +32,10 @@ _WIDEST = 0.25
 """Half-width of a 95 % interval, relative to its parameter, that still tells something about the specimen."""
 
 _CONFOUNDED = 0.9
+_COMES_BACK = 0.2
+_AT_THE_ENDS = 5
+"""Of what was left when the tip let go: what comes back of a specimen that has not slipped; samples to tell it by."""
+
 _SPRINGS_AND_DAMPER = (K1, K2, B_LOADING)
 _PLACES = {"k1": K1, "k2": K2, "b": B_LOADING, "slip": SLIP, "slip_rate": RATE}
 
@@ -59,7 +64,9 @@ class ProtocolFit:
         residual_uN: RMS of the force's own residual, the noise of the deformation taken off.
         within_noise: noise alone explains the residuals.
         misfit: test of the residual's structure.
-        deepest_um, fastest_um_s: largest compression and speed of compression among the samples.
+        deepest_um: largest compression among the samples. fastest_um_s, fastest_unloading_um_s: largest speeds among
+            them, of the contact point or, where that is faster, of the compression; without an unloading the latter
+            is that of the loading.
         likelihood_cost: −2·log-likelihood but for a constant, plus the price of the parameters (Schwarz' criterion).
     """
 
@@ -93,6 +100,7 @@ class ProtocolFit:
     misfit: StructureTest
     deepest_um: float
     fastest_um_s: float
+    fastest_unloading_um_s: float
     likelihood_cost: float
 
     def model(self) -> SpecimenModel:
@@ -110,6 +118,7 @@ class ProtocolFit:
             residual_uN=self.residual_uN,
             deepest_um=self.deepest_um,
             fastest_um_s=self.fastest_um_s,
+            fastest_unloading_um_s=self.fastest_unloading_um_s,
         )
 
 
@@ -144,7 +153,7 @@ def weak_parameters(
     *,
     slips: bool,
     structured_uN: float,
-    noise_ratio: float | None,
+    misfit: str,
 ) -> dict[str, str]:
     """Reasons why the record does not determine a parameter, for those that it does not.
 
@@ -155,12 +164,13 @@ def weak_parameters(
         motion: of the samples that the protocol is judged by.
         slips: offset and α were estimated.
         structured_uN: RMS of what the model does not explain; a parameter may be off by as much as explains this.
-        noise_ratio: RMS residual over the noise's where the model does not explain these samples; None where it does.
-            Springs and damper then follow from which samples were fitted, and their intervals say nothing.
+        misfit: how the model does not explain these samples; empty where it does. Springs and damper then follow from
+            which samples were fitted, and their intervals say nothing.
     """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     x, v, a = motion
     levers = {K1: x, K2: x**3, B_LOADING: v, SLIP: slopes_of(theta, motion)[0]}
+    came_back = _came_back(prepared) if slips else []
     reasons: dict[str, str] = {}
     for name, place in _PLACES.items():
         if place in (SLIP, RATE) and not slips:
@@ -168,20 +178,40 @@ def weak_parameters(
         value, half = float(theta[place]), float(INTERVAL * sigma[place])
         systematic = structured_uN / float(np.sqrt(np.mean(levers[place] ** 2))) if place in levers else 0.0
         why = []
-        if noise_ratio is not None and place in _SPRINGS_AND_DAMPER:
-            why.append(f"the model does not explain the record: {noise_ratio:.3g} × noise")
+        if misfit and place in _SPRINGS_AND_DAMPER:
+            why.append(misfit)
         if value <= 0.0:
             why.append(f"the estimate {value:.3g} is not positive")
         if not half <= _WIDEST * abs(value):
             why.append(f"95 % interval {value - half:.3g} to {value + half:.3g}")
         if not systematic <= _WIDEST * abs(value):
             why.append(f"what the model leaves unexplained is worth {systematic:.2g} of it")
+        if place in (SLIP, RATE):
+            why += came_back
         if why and name == "b":
             why.append(_confounded(prepared, theta, covariance, sigma))
         if why:
             reasons[name] = "; ".join(part for part in why if part)
     reasons["m"] = _no_mass(prepared, a)
     return reasons
+
+
+def _came_back(prepared: Prepared) -> list[str]:
+    """What has slipped stays where it is: a surface that comes back once it is let go has yielded, Bilen et al., III.C.
+
+    Empty where the surface did not, or was not seen by itself.
+    """
+    after = prepared.deformation_um[prepared.branches.lost.start : prepared.branches.lost.stop]
+    if prepared.contact.seen != "surface" or len(after) < 2 * _AT_THE_ENDS:
+        return []
+    left_um = float(np.median(after[:_AT_THE_ENDS])) - prepared.contact.contact_um
+    back_um = float(np.median(after[:_AT_THE_ENDS]) - np.median(after[-_AT_THE_ENDS:]))
+    if back_um < max(_COMES_BACK * left_um, CLEAR * prepared.deformation_sigma_um):
+        return []
+    return [
+        f"after the tip had left, the surface came back by {back_um:.2g} of the {left_um:.2g} µm that were left: the "
+        "specimen yields slowly, it has not slipped"
+    ]
 
 
 def _no_mass(prepared: Prepared, acceleration_um_s2: Array) -> str:
@@ -207,7 +237,7 @@ def _confounded(prepared: Prepared, theta: Array, covariance: Array, sigma: Arra
         prepared.time_s[last] - prepared.time_s[first]
     )
     shift = abs(float(theta[K1])) * INTERVAL * known / abs(speed)
-    begins = "the record begins in contact, and " if prepared.contact.seen == "nothing" else ""
+    begins = "the record begins in contact, or noise hides where, and " if prepared.contact.seen == "nothing" else ""
     return (
         f"{begins}at constant speed b·v cannot be told from the contact point: known to ±{INTERVAL * known:.2g} µm, "
         f"that alone is ±{shift:.2g} µN·s/µm of b"

@@ -29,6 +29,13 @@ _PA_PER_UN_UM2 = 1e6
 _STATED_OVER_OBSERVED_NOISE = (300.0, 3000.0)
 """Of a force in mN whose noise is stated in µN."""
 
+_OUTERMOST, _CLEARLY_TOGETHER = 0.2, 0.5
+"""Share of the deformation's range in which no force is largest; correlation of force and deformation that is clear."""
+
+_PRESSED_AGAIN, _LET_GO, _CAME_BACK = 0.5, 0.25, 0.3
+"""Shares: of the force's range above which a tool presses, and below which it has let go; of the deformation's range by
+which it must have come back in between."""
+
 _USABLE_SHARE = 0.5
 _PRESSES = 0.02
 _UNITS = "give time_s in s, deformation in µm and force in µN (1 mN is 1000 µN)"
@@ -119,8 +126,10 @@ def check(record: IndentationRecord) -> None:
                 f"{name} is not a number in {len(bad)} samples, first at {record.time_s[bad[0]]:.3f} s",
                 remedy="mark the samples as lost, or record again",
             )
+    _check_signs(record, unseen)
     _check_force(record, unseen)
     _check_units(record, unseen)
+    _check_one(record, unseen)
 
 
 def _check_shapes(record: IndentationRecord) -> None:
@@ -181,8 +190,7 @@ def _check_force(record: IndentationRecord, unseen: Mask) -> None:
             f"implausible units: the force has noise of {observed:.3g} µN, stated is {record.force_sigma_uN:.3g} µN",
             remedy=_UNITS,
         )
-    # Medians of five: a single outlier is no contact.
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(force, 5), axis=1)
+    smooth = _smooth(force)
     if np.ptp(smooth) < CLEAR * noise:
         raise NoContact(
             f"no contact: the force varies by {np.ptp(smooth):.3g} µN over the whole travel, noise is {noise:.3g} µN",
@@ -191,7 +199,62 @@ def _check_force(record: IndentationRecord, unseen: Mask) -> None:
     if smooth.max() - smooth[0] < smooth[0] - smooth.min() and not _starts_deep(record, unseen):
         raise DataError(
             f"the specimen pulls: the force goes from {smooth[0]:.4g} down to {smooth.min():.4g} µN",
-            remedy="forces are positive while the probe is pressed: check the sensor's axis and sign in the rig file",
+            remedy="forces are positive while the probe is pressed: change the sign of force_uN, or turn the sensor's "
+            "axis round in the rig file",
+        )
+
+
+def _smooth(values: Array) -> Array:
+    """Medians of five, two samples shorter at either end: a single outlier is no contact and no reversal."""
+    smooth: Array = np.median(np.lib.stride_tricks.sliding_window_view(values, 5), axis=1)
+    return smooth
+
+
+def _check_signs(record: IndentationRecord, unseen: Mask) -> None:
+    """Whether the deformation grows where the force does, and both are positive."""
+    force, deformation = _smooth(record.force_uN[~unseen]), _smooth(record.deformation_um[~unseen])
+    if min(np.ptp(force), np.ptp(deformation)) == 0.0:
+        return
+    together = float(np.corrcoef(force, deformation)[0, 1])
+    hardest = int(np.argmax(np.abs(force - force[0])))
+    place = (deformation[hardest] - deformation.min()) / np.ptp(deformation)
+    if place > _OUTERMOST or abs(together) < _CLEARLY_TOGETHER:
+        return
+    at = f"the force of {force[hardest]:.4g} µN belongs to an indentation of {deformation[hardest]:.4g} µm"
+    if together < 0.0 and force[hardest] > force[0]:
+        raise DataError(
+            f"the deformation is reversed: it falls while the force rises, and {at}",
+            remedy="the deformation is positive into the specimen: change the sign of indentation_um",
+        )
+    if together > 0.0 and force[hardest] < min(force[0], 0.0) and -force.min() > force.max():
+        raise DataError(
+            f"force and deformation are reversed: both fall, and {at}",
+            remedy="both are positive while the probe is pressed: change the signs of force_uN and indentation_um",
+        )
+
+
+def _check_one(record: IndentationRecord, unseen: Mask) -> None:
+    """Whether the record holds one indentation: the force does not rise again after the tool has come back."""
+    time_s = record.time_s[~unseen][2:-2]
+    force, deformation = _smooth(record.force_uN[~unseen]), _smooth(record.deformation_um[~unseen])
+    level = (force - force.min()) / np.ptp(force)
+    way = (deformation - deformation.min()) / np.ptp(deformation)
+    tops: list[int] = []
+    between: list[int] = []
+    for first, last in runs(level > _PRESSED_AGAIN):
+        top = first + int(np.argmax(force[first:last]))
+        if tops:
+            low = tops[-1] + int(np.argmin(level[tops[-1] : first + 1]))
+            back = float(way[tops[-1] : first + 1].min())
+            if level[low] > _LET_GO or min(way[tops[-1]], way[top]) - back < _CAME_BACK:
+                continue
+            between.append(low)
+        tops.append(top)
+    if between:
+        cuts = ", ".join(f"{time_s[low]:.2f} s" for low in between)
+        raise DataError(
+            f"the record holds {len(tops)} indentations: it presses again after {cuts}",
+            remedy=f"cut it at {cuts}, and analyse each part by itself",
         )
 
 
@@ -207,7 +270,7 @@ def _check_units(record: IndentationRecord, unseen: Mask) -> None:
     if depth < CLEAR * _noise(record.deformation_sigma_um, deformation) or depth == 0.0:
         raise DataError(
             f"the deformation varies by {depth:.3g} µm only, which is its noise",
-            remedy="check that the camera follows the contact point, and that deformation_um is in µm",
+            remedy="check that the contact point is followed, and that its deformation (indentation_um) is in µm",
         )
     largest = float(np.max(np.abs(force)))
     # Of the way, only where it presses: a tip may come from far.

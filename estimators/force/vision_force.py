@@ -155,7 +155,8 @@ class VisionForce:
 
     def _is_outside(self, motion: Motion, x_um: float, v_um_s: float) -> bool:
         deeper = x_um - _RANGE_SIGMAS * motion.sigma_um > self.model.deepest_um
-        return deeper or abs(v_um_s) - _RANGE_SIGMAS * motion.velocity_sigma_um_s > self.model.fastest_um_s
+        fastest_um_s = self.model.fastest_um_s if v_um_s > 0.0 else self.model.fastest_unloading_um_s
+        return deeper or abs(v_um_s) - _RANGE_SIGMAS * motion.velocity_sigma_um_s > fastest_um_s
 
     def _publish(
         self, frame: DeformationSample, force_uN: float, sigma_uN: float, velocity_um_s: float, flags: set[str]

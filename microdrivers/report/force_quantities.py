@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from microdrivers.report.number_format import compact, significant, with_uncertainty
-from microdrivers.results.force import PROTOCOLS, ForceResult, ProtocolName, ProtocolResult
+from microdrivers.report.number_format import compact, significant, with_uncertainty, without_exponents
+from microdrivers.results.force import PROTOCOLS, ForceResult, ProtocolName, ProtocolResult, VisionCheck
 
 FACTOR_95 = 1.96
 K2_UNIT = "10⁻⁶ µN/µm³"
@@ -28,6 +29,12 @@ PAPER: dict[ProtocolName, tuple[str, str, str, str]] = {
 }
 """k1 (µN/µm), k2 (10⁻⁶ µN/µm³), b (µN·s/µm) and error, Bilen et al., section III.C, each from an embryo of its own."""
 
+_AS_STIFF = (0.3, 60.0)
+"""k1 (µN/µm), a tenth of the paper's softest to ten times its stiffest: others have nothing to do with its embryos."""
+
+_WIDE = "its 95 % interval is wide"
+_AT_THE_REVERSAL_S = 0.5
+
 
 class Quantity(NamedTuple):
     """A parameter as text; in brackets if the record does not determine it. `plus_minus`: half of its 95 % interval."""
@@ -49,7 +56,7 @@ class Quantity(NamedTuple):
 
 
 class ProtocolRow(NamedTuple):
-    """One way to fit the model, as text; `weak` says why the record does not determine what."""
+    """One way to fit the model, as text; `weak` holds (parameter, why it is not determined), `paper` may be empty."""
 
     key: ProtocolName
     name: str
@@ -58,8 +65,8 @@ class ProtocolRow(NamedTuple):
     b: Quantity
     error: str
     noise: str
-    weak: tuple[str, ...]
-    paper: tuple[str, str, str, str]
+    weak: tuple[tuple[str, str], ...]
+    paper: tuple[str, ...]
     best: bool
 
 
@@ -88,10 +95,68 @@ def _row(result: ForceResult, key: ProtocolName, fit: ProtocolResult) -> Protoco
         b=_number(fit.b_uN_s_per_um, fit.b_sigma_uN_s_per_um, weak="b" in weak),
         error=f"{significant(fit.error_percent, 3)} %",
         noise="" if fit.noise_residual_ratio is None else f"{significant(fit.noise_residual_ratio, 2)} ×",
-        weak=tuple(f"{name}: {known.reasons.get(name, 'not determined')}" for name in weak),
-        paper=PAPER[key],
+        weak=tuple((name, reason) for name in weak for reason in _foremost(known.reasons.get(name, ""))),
+        paper=PAPER[key] if _AS_STIFF[0] <= result.protocols[result.best].k1_uN_per_um <= _AS_STIFF[1] else (),
         best=key == result.best,
     )
+
+
+def _foremost(reasons: str) -> list[str]:
+    """Of a number that comes from a misfit, that is all that need be said; `result.json` has the rest."""
+    found = reasons.split("; ")
+    return [reason for reason in found if reason.startswith("the model does not explain")] or found
+
+
+def weak_lines(rows: Sequence[ProtocolRow]) -> list[str]:
+    """Why values stand in brackets: one line for all protocols of which the same is true."""
+    protocols: dict[str, list[str]] = {}
+    for row in rows:
+        names: dict[str, list[str]] = {}
+        for name, reason in row.weak:
+            said = _WIDE if reason.startswith("95 % interval") else without_exponents(reason) or "not determined"
+            names.setdefault(said, []).append(name)
+        if names:
+            text = "; ".join(f"{', '.join(which)}: {said}" for said, which in names.items())
+            protocols.setdefault(text, []).append(row.key)
+    return [f"{', '.join(keys)} – {text}" for text, keys in protocols.items()]
+
+
+def pressed_text(result: ForceResult) -> str:
+    """How the specimen was pressed: depth, force, and speeds in and out."""
+    setup = result.setup
+    force = f"{significant(setup.largest_force_uN, 4)} µN"
+    if result.excluded_samples.get("saturated"):
+        force = f"beyond {force}, where the sensor’s range ends"
+    speed = f"in at {compact(setup.speed_um_s)} µm/s"
+    if setup.unloading_speed_um_s is not None:
+        speed += f", back at {compact(setup.unloading_speed_um_s)} µm/s"
+    pressed_um = setup.deepest_um if setup.pressed_um is None else setup.pressed_um
+    return f"{significant(pressed_um, 4)} µm, {force}; {speed}"
+
+
+def valid_depth_text(result: ForceResult) -> str:
+    """How deep the best model is valid, and in which coordinate."""
+    depth = f"compression up to {significant(result.setup.deepest_um, 4)} µm"
+    slips = result.best == "slip_corrected"
+    return f"{depth}: x* of eq. (26), the slip taken off" if slips else f"{depth} from the undeformed surface"
+
+
+def valid_speed_text(result: ForceResult) -> str:
+    """How fast the best model is valid."""
+    setup = result.setup
+    speed = f"up to {compact(setup.fastest_um_s or setup.speed_um_s)} µm/s in"
+    if setup.unloading_speed_um_s is None or setup.fastest_unloading_um_s is None:
+        return speed
+    return f"{speed}, {compact(setup.fastest_unloading_um_s)} µm/s back"
+
+
+def camera_text(check: VisionCheck) -> str:
+    """How well the camera alone told the force of a fresh indentation, and where it was worst."""
+    worst = f"at most {significant(check.largest_error_uN, 3)} µN off"
+    if check.largest_error_s is not None and check.deepest_s is not None:
+        near = abs(check.largest_error_s - check.deepest_s) < _AT_THE_REVERSAL_S
+        worst += ", at the reversal" if near else f", at {check.largest_error_s:.1f} s"
+    return f"force within {significant(check.error_percent, 2)} % RMS of the sensor’s in a fresh indentation; {worst}"
 
 
 def _number(value: float, sigma: float | None, *, weak: bool, scale: float = 1.0) -> Quantity:
@@ -134,10 +199,11 @@ def slip_text(result: ForceResult) -> str:
         return "the best fit does without"
     offset = with_uncertainty(slip.offset_um, _half(slip.offset_sigma_um))
     rate = with_uncertainty(slip.rate_per_s, _half(slip.rate_sigma_per_s))
-    return (
-        f"offset {offset.value}{_plus(offset.plus_minus)} µm (paper: 25 µm), "
-        f"α = {rate.value}{_plus(rate.plus_minus)} per s (not printed)"
-    )
+    offset_text = f"{offset.value}{_plus(offset.plus_minus)} µm"
+    rate_text = f"{rate.value}{_plus(rate.plus_minus)} per s"
+    if not slip.identifiable:
+        return f"(offset {offset_text}, α = {rate_text}), not to be quoted: {without_exponents(slip.reason)}"
+    return f"offset {offset_text} (paper: 25 µm), α = {rate_text} (not printed)"
 
 
 def _half(sigma: float | None) -> float | None:

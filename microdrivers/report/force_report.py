@@ -6,8 +6,20 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from microdrivers.report.force_quantities import FACTOR_95, K2_UNIT, excluded_text, protocol_rows, slip_text, truth_rows
-from microdrivers.report.number_format import compact, significant, with_uncertainty
+from microdrivers.report.force_quantities import (
+    FACTOR_95,
+    K2_UNIT,
+    camera_text,
+    excluded_text,
+    pressed_text,
+    protocol_rows,
+    slip_text,
+    truth_rows,
+    valid_depth_text,
+    valid_speed_text,
+    weak_lines,
+)
+from microdrivers.report.number_format import significant, with_uncertainty, without_exponents
 from microdrivers.report.page import created, page
 from microdrivers.results.force import ForceResult
 
@@ -32,28 +44,37 @@ def force_report_html(result: ForceResult) -> str:
 
     figures = draw_force_figures(result)
     specimen = result.provenance.settings.get("specimen") or (result.truth.preset if result.truth is not None else "")
-    setup, check = result.setup, result.vision_check
+    check, rows = result.vision_check, protocol_rows(result)
     return page(
         _TEMPLATE,
         result,
         title=f"Force characterisation{f' of {specimen}' if specimen else ''}",
         when=created(result.provenance),
-        rows=protocol_rows(result),
-        best=next(row for row in protocol_rows(result) if row.best),
+        rows=rows,
+        weak=weak_lines(rows),
+        best=next(row for row in rows if row.best),
+        misfit=without_exponents(result.misfit.text),
         truths=truth_rows(result),
         k2_unit=K2_UNIT,
         slip=slip_text(result),
         excluded=excluded_text(result),
         samples=len(result.traces.time_s),
-        pressed=f"{significant(setup.deepest_um, 4)} µm, {significant(setup.largest_force_uN, 4)} µN, "
-        f"{compact(setup.speed_um_s)} µm/s",
+        pressed=_unbroken(pressed_text(result)),
+        valid_depth=valid_depth_text(result),
+        valid_speed=valid_speed_text(result),
         scale=_scale(result),
         drift=_drift(result),
         noise=f"{significant(result.deformation_sigma_um, 2)} µm, {significant(result.force_sigma_uN, 2)} µN",
         vision="" if check is None else significant(check.error_percent, 2),
+        worst="" if check is None else camera_text(check).rpartition("; ")[2],
         speed="" if result.largest_speed_um_s is None else significant(result.largest_speed_um_s, 3),
         figures={name: Markup(svg) for name, svg in figures._asdict().items() if svg} if figures else {},
     )
+
+
+def _unbroken(text: str) -> str:
+    """Numbers stay on the line of their units."""
+    return text.replace(" µ", "\u00a0µ").replace("µm/s", "µm/\u2060s")
 
 
 def _scale(result: ForceResult) -> str:

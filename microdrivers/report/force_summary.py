@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import textwrap
 
-from microdrivers.report.force_quantities import K2_UNIT, excluded_text, protocol_rows, slip_text, truth_rows
-from microdrivers.report.number_format import compact, significant
+from microdrivers.report.force_quantities import (
+    K2_UNIT,
+    camera_text,
+    excluded_text,
+    pressed_text,
+    protocol_rows,
+    slip_text,
+    truth_rows,
+    valid_depth_text,
+    valid_speed_text,
+)
+from microdrivers.report.number_format import significant, without_exponents
 from microdrivers.report.page import created, run_kind
 from microdrivers.results.force import ForceResult
 
@@ -38,10 +48,12 @@ def _heading(result: ForceResult) -> list[str]:
 
 
 def _protocols(result: ForceResult) -> list[str]:
-    rows = [["", "k1 (µN/µm)", f"k2 ({K2_UNIT})", "b (µN·s/µm)", "error", "paper"]]
+    found = protocol_rows(result)
+    heads = ["", "k1 (µN/µm)", f"k2 ({K2_UNIT})", "b (µN·s/µm)", "error"]
+    rows = [heads + ["paper"] * any(row.paper for row in found)]
     rows += [
-        [f"{'*' if row.best else ' '} {row.key}", row.k1.text, row.k2.text, row.b.text, row.error, row.paper[3]]
-        for row in protocol_rows(result)
+        [f"{'*' if row.best else ' '} {row.key}", row.k1.text, row.k2.text, row.b.text, row.error, *row.paper[3:]]
+        for row in found
     ]
     lines = _table(rows)
     truth = truth_rows(result)
@@ -58,30 +70,28 @@ def _table(rows: list[list[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
 
 
+def _best(result: ForceResult) -> str:
+    return f"{result.best} (*)" + ", which does not explain the specimen" * result.misfit.found
+
+
 def _performance(result: ForceResult) -> list[str]:
-    setup = result.setup
     rows = [
-        ("Best", f"{result.best} (*); error is RMS(F − F̂)/RMS(F)"),
-        ("Pressed", f"{significant(setup.deepest_um, 4)} µm, {significant(setup.largest_force_uN, 4)} µN, "
-         f"{compact(setup.speed_um_s)} µm/s"),
-    ]  # fmt: skip
+        ("Best", f"{_best(result)}; error is RMS(F − F̂)/RMS(F) over the samples used"),
+        ("Pressed", pressed_text(result)),
+        ("Valid for", f"{valid_depth_text(result)}; {valid_speed_text(result)}"),
+    ]
     slip = slip_text(result)
     if slip and result.best == "slip_corrected":
         rows.append(("Slip", slip))
     if any(quantity.weak for row in protocol_rows(result) for quantity in (row.k1, row.k2, row.b)):
         rows.append(("In brackets", "not to be quoted as properties of the specimen; report.html says why"))
-    rows.append(("Residual", result.misfit.text))
-    check = result.vision_check
-    if check is not None:
-        rows.append(
-            (
-                "Camera alone",
-                f"force within {significant(check.error_percent, 2)} % of the sensor's in a fresh indentation",
-            )
-        )
+    rows.append(("Residual", without_exponents(result.misfit.text)))
+    if result.vision_check is not None:
+        rows.append(("Camera alone", camera_text(result.vision_check)))
     if result.largest_speed_um_s is not None:
+        force_uN = significant(result.setup.largest_force_uN, 4)
         rows.append(
-            ("Speed limit", f"{significant(result.largest_speed_um_s, 3)} µm/s keep below that force at that depth")
+            ("Speed limit", f"{significant(result.largest_speed_um_s, 3)} µm/s keep below {force_uN} µN in that range")
         )
     excluded = excluded_text(result)
     if excluded:

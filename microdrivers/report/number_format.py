@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import NamedTuple
 
 MINUS = "−"
 _MOST_DIGITS = 10
+_EXPONENT = re.compile(r"(?<=\d)e([+-])0*(\d+)\b")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class Formatted(NamedTuple):
@@ -36,6 +39,15 @@ def compact(value: float) -> str:
     """A setting as one would say it: at most four significant digits, no trailing zeros."""
     text = significant(value, 4)
     return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def without_exponents(text: str) -> str:
+    """A sentence with powers of ten in place of numbers such as 1.4e-05, and true minus signs before numbers."""
+
+    def power(found: re.Match[str]) -> str:
+        return "·10" + f"{found[1].strip('+')}{found[2]}".translate(_SUPERSCRIPTS)
+
+    return re.sub(r"(?<![\w.])-(?=\d)", MINUS, _EXPONENT.sub(power, text))
 
 
 def with_uncertainty(value: float, half_width: float | None) -> Formatted:

@@ -43,7 +43,7 @@ def optics_report_html(result: OpticsResult) -> str:
     return page(
         _TEMPLATE,
         result,
-        title=f"Optical calibration of {result.provenance.rig_name}",
+        title=f"Optical calibration of {result.provenance.rig_name or result.valid_for.camera}",
         quantities=key_quantities(result),
         projection=projection_quantities(result),
         settling=settling(result),

@@ -36,7 +36,8 @@ def optics_summary(result: OpticsResult) -> str:
 
 def _heading(result: OpticsResult) -> list[str]:
     provenance = result.provenance
-    what = f"{provenance.rig_name}, {result.valid_for.camera}, {zoom_name(result.zoom)}"
+    # Of an image sequence no rig is known.
+    what = ", ".join(filter(None, (provenance.rig_name, result.valid_for.camera, zoom_name(result.zoom))))
     state = "complete" if result.complete else "INTERRUPTED"
     return [f"Optical calibration of {what}", f"{run_kind(provenance).label}, {state}, {created(provenance)}"]
 

@@ -18,6 +18,11 @@ from microdrivers.results.record import Provenance, Record, Trace
 
 SCHEMA_VERSION = 1
 
+_COORDINATES = """\
+# The model's x is the deformation less contact_um and, if there is one, less the slip of eq. (26). valid_for is what x
+# and its rate may be; pressed_um is how far the contact point went in, slip included.
+"""
+
 ProtocolName = Literal["single", "unloading_springs", "loading_only", "slip_corrected", "loading"]
 PROTOCOLS: tuple[ProtocolName, ...] = ("single", "unloading_springs", "loading_only", "slip_corrected", "loading")
 """The paper's four ways to fit its model, section III.C, and the loading part alone."""
@@ -52,7 +57,8 @@ class Identifiable(Record):
 class SlipFit(Record):
     """Bilen et al., eq. (26): x*(t) = x(t) − offset·(1 − e^(−α·t)), t from the contact, as `slip_corrected` has it.
 
-    `not_returned_um` is the deformation that was left when contact was lost; None if it was not lost.
+    `not_returned_um` is the deformation that was left when contact was lost; None if it was not lost. `reason` says why
+    it is not identifiable: offset and rate are then no properties of the specimen, not even of its holder.
     """
 
     offset_um: float
@@ -61,6 +67,7 @@ class SlipFit(Record):
     rate_sigma_per_s: float | None
     not_returned_um: float | None
     identifiable: bool
+    reason: str = ""
 
 
 class ProtocolResult(Record):
@@ -70,7 +77,8 @@ class ProtocolResult(Record):
         b_uN_s_per_um: while loading. b_unloading_uN_s_per_um: on the way back; 0 where the protocol says so.
         m_kg: None where the record does not determine it: at constant speed it never does.
         covariance: 3×3, of k1, k2, b in these units. sigma_*: standard deviations.
-        error_percent: 100·RMS(F − F̂)/RMS(F), over all samples of both branches (of loading alone for `loading`).
+        error_percent: 100·RMS(F − F̂)/RMS(F), over the samples of both branches (of loading alone for `loading`) that
+            fits use: `ForceResult.excluded_samples` are not counted, so no reversal.
         residual_uN: RMS of the force's own residual, the noise of the image taken off.
         noise_residual_ratio: RMS residual over that which the noise of force and image alone would leave.
         identifiable: per parameter; one that is not must not be quoted as a property of the specimen.
@@ -107,12 +115,17 @@ class Misfit(Record):
 
 
 class VisionCheck(Record):
-    """A fresh indentation of the same specimen with the force from the camera alone, against the sensor."""
+    """A fresh indentation of the same specimen with the force from the camera alone, against the sensor.
+
+    All its frames count, reversals included. `largest_error_s` and `deepest_s` are instants of `ForceTraces.check_*`.
+    """
 
     error_percent: float
     largest_error_uN: float
     samples: int
     outside_range: int
+    largest_error_s: float | None = None
+    deepest_s: float | None = None
 
 
 class ForceTraces(Record):
@@ -152,6 +165,11 @@ class Setup(Record):
 
     `scale_source`: the probe's own travel, an optical calibration, or a recording that states µm.
     `image_drift_um_s`: of the picture along the probing direction, as a probe that has come back shows it; taken off.
+    `speed_um_s`, `unloading_speed_um_s`: of the tool; of a recording, the contact point's mean speed in and out.
+    `pressed_um`: how far the contact point was pressed in from the undeformed surface. `deepest_um`: how deep the best
+    model is valid, in its own compression x: of a specimen that slipped, x*, which is less by what the holder gave way.
+    `fastest_um_s`, `fastest_unloading_um_s`: how fast the best model is valid, in and out.
+    `largest_force_uN`: within the sensor's range; samples at the end of it are not counted.
     """
 
     sensor: str
@@ -167,6 +185,10 @@ class Setup(Record):
     tare_uN: float | None
     image_drift_um_s: float | None = None
     image_drift_sigma_um_s: float | None = None
+    unloading_speed_um_s: float | None = None
+    pressed_um: float | None = None
+    fastest_um_s: float | None = None
+    fastest_unloading_um_s: float | None = None
 
 
 class ForceResult(Record):
@@ -201,9 +223,13 @@ class ForceResult(Record):
     provenance: Provenance
     truth: ForceTruth | None = None
 
+    def as_json(self) -> str:
+        """All of it as in `result.json`; keys in the order of this class."""
+        return self.model_dump_json(indent=1) + "\n"
+
     def write_json(self, file: Path) -> None:
-        """Write `result.json`; keys in the order of this class."""
-        file.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        """Write `result.json`."""
+        file.write_text(self.as_json(), encoding="utf-8")
 
     def write_specimen(self, file: Path) -> None:
         """Write `specimen.yaml`: what is needed to read force from the camera, and what it is valid for.
@@ -228,16 +254,18 @@ class ForceResult(Record):
             "misfit": self.misfit.found,
             "valid_for": {
                 "deepest_um": self.setup.deepest_um,
-                "fastest_um_s": self.setup.speed_um_s,
+                "fastest_um_s": self.setup.fastest_um_s,
+                "fastest_unloading_um_s": self.setup.fastest_unloading_um_s,
                 "force_uN": self.setup.largest_force_uN,
             },
+            "pressed_um": self.setup.pressed_um,
             "vision_force_error_percent": self.vision_force_error_percent,
             "created_utc": self.provenance.created_utc,
             "rig": self.provenance.rig_name,
             "complete": self.complete,
             "simulated": self.provenance.fake,
         }
-        file.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        file.write_text(_COORDINATES + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def read_force_result(file: Path) -> ForceResult:

@@ -145,9 +145,13 @@ class OpticsResult(Record):
     provenance: Provenance
     truth: Truth | None = None
 
+    def as_json(self) -> str:
+        """All of it as in `result.json`; keys in the order of this class."""
+        return self.model_dump_json(indent=1) + "\n"
+
     def write_json(self, file: Path) -> None:
-        """Write `result.json`; keys in the order of this class."""
-        file.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        """Write `result.json`."""
+        file.write_text(self.as_json(), encoding="utf-8")
 
     def write_calibration(self, file: Path) -> None:
         """Write `calibration.yaml`: what is needed to use the calibration, and what it is valid for."""
@@ -165,7 +169,7 @@ class OpticsResult(Record):
             "covariance": self.covariance,
             "degrees_of_freedom": self.degrees_of_freedom,
             "created_utc": self.provenance.created_utc,
-            "rig": self.provenance.rig_name,
+            "rig": self.provenance.rig_name or None,
             "complete": self.complete,
             "simulated": self.provenance.fake,
         }

@@ -27,6 +27,7 @@ class _Slip(_Part):
 class _ValidFor(_Part):
     deepest_um: Annotated[_Finite, pydantic.Field(gt=0.0)]
     fastest_um_s: Annotated[_Finite, pydantic.Field(gt=0.0)]
+    fastest_unloading_um_s: Annotated[_Finite, pydantic.Field(gt=0.0)] | None = None
 
 
 class _Specimen(_Part):
@@ -62,7 +63,7 @@ def read_specimen(file: Path) -> SpecimenModel:
             f"not a specimen of schema version 1: {error}",
             file=str(file), remedy="give the specimen.yaml of `microdrivers calibrate force`",
         ) from error  # fmt: skip
-    slip, covariance = found.slip, found.covariance_of_k1_k2_b
+    slip, covariance, valid_for = found.slip, found.covariance_of_k1_k2_b, found.valid_for
     return SpecimenModel(
         k1_uN_per_um=found.k1_uN_per_um,
         k2_uN_per_um3=found.k2_uN_per_um3,
@@ -74,6 +75,7 @@ def read_specimen(file: Path) -> SpecimenModel:
         slip_rate_per_s=0.0 if slip is None else slip.rate_per_s,
         covariance=() if covariance is None else tuple(value for row in covariance for value in row),
         residual_uN=found.residual_uN,
-        deepest_um=found.valid_for.deepest_um,
-        fastest_um_s=found.valid_for.fastest_um_s,
+        deepest_um=valid_for.deepest_um,
+        fastest_um_s=valid_for.fastest_um_s,
+        fastest_unloading_um_s=valid_for.fastest_unloading_um_s or valid_for.fastest_um_s,
     )

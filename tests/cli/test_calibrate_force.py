@@ -1,13 +1,17 @@
 """`calibrate force`: what cannot be analysed is refused, and what was measured is kept however it ends."""
 
 import csv
+import json
 import pathlib
 
 import pytest
+import yaml
 
 from microdrivers.cli.calibrate_force import _run
 from microdrivers.cli.progress import TerminalProgress
+from microdrivers.configs import shipped_rig
 from microdrivers.core.errors import MoveCancelled
+from microdrivers.estimators.force.identify import IdentificationSettings
 from microdrivers.results.force import read_force_result
 from tests.routines.indentation_source import K1, MadeUpSource
 
@@ -21,11 +25,44 @@ def measured(folder):
 
 
 def test_nothing_is_opened_if_the_operator_says_no(run, tmp_path):
-    result = run("calibrate", "force", "--rig", tmp_path / "no.yaml", "--out", tmp_path / "out", stdin="n\n")
+    result = run("calibrate", "force", "--rig", shipped_rig(), "--out", tmp_path / "out", stdin="n\n")
     assert result.exit_code == 1
     assert "Is the specimen held" in result.stderr
+    assert "no force guard" not in result.stderr
     assert "Aborted" in result.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_who_presses_without_a_guard_is_told_before(run, tmp_path):
+    data = yaml.safe_load(shipped_rig().read_text(encoding="utf-8")) | {"safety": "none"}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    result = run("calibrate", "force", "--rig", "rig.yaml", "--out", tmp_path / "out", stdin="n\n")
+    told, _, asked = result.stderr.partition("\n")
+    assert told == "no force guard watches probe_force: the rig file's safety section states none"
+    assert "Is the specimen held" in asked
+
+
+def test_a_result_is_never_written_over(run, tmp_path):
+    (tmp_path / "result.json").write_text("{}")
+    result = run("calibrate", "force", "--no-record", "--out", tmp_path)
+    assert (result.exit_code, "a result is never written over" in result.stderr) == (1, True)
+    assert run("calibrate", "optics", "--no-record", "--out", tmp_path).exit_code == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_an_error_is_json_where_the_result_would_be(run, tmp_path):
+    file = tmp_path / "indentation.csv"
+    file.write_text("time_s,indentation_um\n0,1\n")
+    result = run("calibrate", "force", "--csv", file, "--json")
+    assert result.exit_code == 1
+    error = json.loads(result.stdout)["error"]
+    assert error["kind"] in ("ConfigError", "ConfigErrors")
+    assert error["file"] == str(file)
+    assert error["remedy"]
+    assert "to do:" in result.stderr
+    assert run("calibrate", "force", "--csv", file).stdout == ""
+    rig = json.loads(run("status", tmp_path / "none.yaml", "--json").stdout)
+    assert rig["error"]["file"] == str(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-1"])
@@ -42,7 +79,7 @@ def test_a_figure_that_cannot_be_is_refused_before_anything_opens(run, tmp_path,
 def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=600, error=MoveCancelled("the force guard has stopped it"))
     with pytest.raises(MoveCancelled):
-        _run(source, KNOWN, True, tmp_path, False, TerminalProgress(quiet=True))
+        _run(source, dict(KNOWN), True, IdentificationSettings(), tmp_path, False, TerminalProgress(quiet=True))
     result = read_force_result(tmp_path / "result.json")
     assert not result.complete
     assert result.notes[-1] == (
@@ -51,15 +88,21 @@ def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path,
     assert result.protocols["single"].k1_uN_per_um == pytest.approx(K1, rel=0.05)
     assert len(measured(tmp_path)) == 600
     assert "ended early" in (tmp_path / "report.html").read_text()
-    assert f"what was measured is in {tmp_path / 'record.csv'}" in capsys.readouterr().err
+    told = f"what was measured is in {tmp_path / 'record.csv'}; to analyse it: microdrivers calibrate force --csv "
+    assert told in capsys.readouterr().err
 
 
-def test_an_interruption_before_the_contact_keeps_the_record(tmp_path):
+def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=60, error=KeyboardInterrupt())
+    source.whereabouts = "probe_stage stands at x 10.0 µm; no contact was felt"
     with pytest.raises(KeyboardInterrupt):
-        _run(source, KNOWN, True, tmp_path, False, TerminalProgress(quiet=True))
+        _run(source, dict(KNOWN), True, IdentificationSettings(), tmp_path, False, TerminalProgress(quiet=True))
     assert source.finished == 1
     assert len(measured(tmp_path)) == 60
+    told = capsys.readouterr().err
+    assert "record.csv; nothing follows from it: no contact" in told
+    assert "to analyse it" not in told
+    assert source.whereabouts in told
     assert not (tmp_path / "result.json").exists()
 
 

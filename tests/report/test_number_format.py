@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from microdrivers.report.number_format import MINUS, compact, fixed, significant, with_uncertainty
+from microdrivers.report.number_format import MINUS, compact, fixed, significant, with_uncertainty, without_exponents
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,18 @@ from microdrivers.report.number_format import MINUS, compact, fixed, significant
 )
 def test_uncertainty_has_two_digits_and_the_value_matches(value, half_width, expected):
     assert with_uncertainty(value, half_width)[:2] == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("8.8e-05 µN of noise, p = 6e-13", "8.8·10⁻⁵ µN of noise, p = 6·10⁻¹³"),
+        ("2e+20 to -1.5e+07 in 2026-11-22", "2·10²⁰ to −1.5·10⁷ in 2026-11-22"),
+        ("the estimate -0.446 of slip_corrected-2, 1e5x", "the estimate −0.446 of slip_corrected-2, 1e5x"),
+    ],
+)
+def test_a_sentence_has_powers_of_ten_and_minus_signs(text, expected):
+    assert without_exponents(text) == expected
 
 
 @settings(deadline=None, max_examples=200)

@@ -26,6 +26,7 @@ class MadeUpSource:
 
     past_run = PastRun()
     repeatable = True
+    whereabouts = ""
 
     def __init__(
         self, *, seed=0, broken_off_at=None, error=None, depth_noise_um=0.05, offset_uN=0.0, lost=(), range_uN=1e9,

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -14,13 +15,16 @@ from microdrivers.core.samples import RoutineNote
 from microdrivers.estimators.force.identify import identify
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.recording.indentation_table import IndentationTable
+from microdrivers.report.force_quantities import camera_text, slip_text
 from microdrivers.report.force_report import force_report_html
 from microdrivers.report.force_summary import force_summary
+from microdrivers.report.number_format import significant, without_exponents
 from microdrivers.results.force import read_force_result
 from microdrivers.results.specimen import read_specimen
 from microdrivers.routines.force import Characterisation, IndentationPlayback, build_result
 from microdrivers.routines.provenance import describe_run
-from tests.routines.indentation_source import K1, K2, SPEED_UM_S, B, MadeUpSource
+from tests.estimators.force.indentations import recorded
+from tests.routines.indentation_source import K1, K2, B, MadeUpSource
 
 REAL = pathlib.Path(__file__).parents[1] / "data" / "force" / "chiaro_aebp1_30hz.csv"
 
@@ -61,6 +65,17 @@ def test_the_camera_alone_tells_the_force_of_a_fresh_indentation(characterised):
     assert result.vision_check.samples > 0.9 * len(run.check.samples) - 20
 
 
+def test_the_worst_of_the_camera_is_said(characterised):
+    _, _, result, _ = characterised
+    check, traces = result.vision_check, result.traces
+    off = np.abs(np.array(traces.check_vision_uN) - np.array(traces.check_force_uN))
+    assert check.largest_error_uN == pytest.approx(off.max())
+    assert check.largest_error_s == traces.check_time_s[int(np.argmax(off))]
+    assert f"at most {significant(check.largest_error_uN, 3)} µN off" in force_summary(result)
+    worst = camera_text(check.model_copy(update={"largest_error_s": 20.0, "deepest_s": 19.8}))
+    assert worst.endswith("off, at the reversal")
+
+
 def test_estimates_are_published_while_it_runs(characterised):
     _, run, _, published = characterised
     assert published["specimen"] == run.first.estimates
@@ -93,11 +108,38 @@ def test_the_specimen_file_reads_force_as_the_run_did(characterised, tmp_path):
     result.write_specimen(tmp_path / "specimen.yaml")
     known = run.identification.protocols[run.identification.best].model()
     model = read_specimen(tmp_path / "specimen.yaml")
-    # The file's covariance has the scale's own uncertainty besides, and its range is the speed of the tool.
+    # The file's covariance has the scale's own uncertainty besides.
     assert len(model.covariance) == 9
-    assert model._replace(covariance=(), fastest_um_s=0.0) == known._replace(covariance=(), fastest_um_s=0.0)
+    assert model._replace(covariance=()) == known._replace(covariance=())
     assert model.residual_uN > 0.0
-    assert model.fastest_um_s == result.setup.speed_um_s
+
+
+def test_a_specimen_file_of_before_has_one_speed_for_both_ways(characterised, tmp_path):
+    file = tmp_path / "specimen.yaml"
+    characterised[2].write_specimen(file)
+    file.write_text("".join(line for line in file.read_text().splitlines(True) if "fastest_unloading" not in line))
+    model = read_specimen(file)
+    assert model.fastest_unloading_um_s == model.fastest_um_s
+
+
+def test_pressed_and_valid_are_told_apart_where_the_specimen_slips(tmp_path):
+    record = recorded("slip_corrected")
+    file = tmp_path / "indentation.csv"
+    rows = zip(record.time_s, record.deformation_um, record.force_uN, strict=True)
+    file.write_text("time_s,indentation_um,force_uN\n" + "".join(f"{t},{x},{f}\n" for t, x, f in rows))
+    result = result_of(Characterisation(IndentationPlayback(IndentationTable(file))).run(), clock="recorded")
+    setup = result.setup
+    assert result.best == "slip_corrected"
+    slipped_um = result.slip.offset_um * (1.0 - np.exp(-result.slip.rate_per_s * setup.pressed_um / 5.0))
+    assert setup.pressed_um - setup.deepest_um == pytest.approx(slipped_um, abs=1.0)
+    # On the way back the holder gives way towards the tip: x shrinks faster than the tool goes.
+    assert setup.speed_um_s == pytest.approx(5.0, abs=0.1)
+    assert setup.unloading_speed_um_s == pytest.approx(5.0, abs=0.1)
+    assert setup.fastest_unloading_um_s > 5.1
+    summary = force_summary(result)
+    assert re.search(rf"Pressed +{significant(setup.pressed_um, 4)} µm", summary)
+    assert f"compression up to {significant(setup.deepest_um, 4)} µm" in summary
+    assert "x* of eq. (26)" in summary
 
 
 def test_a_specimen_file_without_what_it_needs_is_refused(characterised, tmp_path):
@@ -129,6 +171,22 @@ def test_a_model_that_does_not_fit_is_said_beside_its_numbers(characterised):
     assert "In brackets" in summary
     (row,) = [line for line in summary.splitlines() if line.startswith("  unloading_springs")]
     assert row.count("(") == 3
+
+
+def test_a_press_without_a_guard_is_told(characterised):
+    _, run, result, _ = characterised
+    assert not any("No force guard" in note for note in result.notes)
+    unguarded = result_of(run._replace(setup=run.setup._replace(guarded=False)))
+    assert any(note.startswith("No force guard watched over the indentation") for note in unguarded.notes)
+
+
+def test_a_slip_that_is_not_identifiable_is_not_quoted(characterised):
+    _, _, result, _ = characterised
+    assert not result.slip.identifiable
+    assert result.slip.reason
+    shown = slip_text(result.model_copy(update={"best": "slip_corrected"}))
+    assert shown.startswith("(offset ")
+    assert f"not to be quoted: {without_exponents(result.slip.reason)}" in shown
 
 
 def test_the_same_samples_give_the_same_bits():
@@ -219,6 +277,8 @@ def test_a_sensor_at_the_end_of_its_range_is_said():
     result = result_of(run)
     assert result.excluded_samples["saturated"] == run.first.unmatched["SATURATED"]
     assert any("end of its range" in note for note in result.notes)
+    assert 240.0 < result.setup.largest_force_uN < 250.0
+    assert "µN, where the sensor’s range ends" in force_summary(result)
     assert result.protocols["single"].k1_uN_per_um == pytest.approx(K1, rel=0.05)
 
 
@@ -248,4 +308,21 @@ def test_a_real_indentation_is_fitted_as_well_as_it_can_be():
     assert result.misfit.found_by == "size"
     assert result.misfit.p_value > 0.01
     assert result.vision_force_error_percent is None
-    assert result.setup.speed_um_s >= SPEED_UM_S
+    assert result.setup.speed_um_s == pytest.approx(5.9, abs=0.1)
+    assert result.setup.fastest_um_s == pytest.approx(7.0, abs=0.1)
+    assert result.setup.fastest_unloading_um_s == pytest.approx(99.0, abs=2.0)
+
+
+def test_the_page_of_what_is_no_embryo_is_short_and_without_the_papers_figures():
+    run = Characterisation(IndentationPlayback(IndentationTable(REAL))).run()
+    result = result_of(run, clock="recorded")
+    page, summary = force_report_html(result), force_summary(result)
+    text = re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
+    reasons = re.findall(r"<li>(.*– .*)</li>", text)
+    assert 3 <= len(reasons) <= 5
+    assert max(map(len, reasons)) < 120
+    assert not re.search(r"\de-\d", text)
+    assert not re.search(r"\de-\d", summary)
+    assert "paper 4.5161" not in text
+    assert "paper" not in summary.split("\n\n")[1]
+    assert "µm/\u2060s" in text

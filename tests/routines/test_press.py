@@ -1,5 +1,7 @@
 """The live experiment on an emulated probe: whatever ends it, the probe goes away and what was measured is kept."""
 
+import re
+
 import msgspec
 import pytest
 
@@ -56,9 +58,9 @@ def interrupt():
     raise KeyboardInterrupt
 
 
-def run(rig, settings=SHORT, steps=None):
+def run(rig, settings=SHORT, steps=None, experiment=None):
     """Characterise; returns the characterisation and what ended it."""
-    characterisation = Characterisation(PressExperiment(rig, settings))
+    characterisation = Characterisation(experiment or PressExperiment(rig, settings))
     try:
         characterisation.run(steps or SilentProgress(), check=False)
     except MicrodriversError as error:
@@ -76,17 +78,23 @@ def test_no_contact_within_the_travel(rig):
 
 def test_an_interruption_of_the_approach_takes_the_probe_away(rig):
     steps = Steps("approach until contact", lambda: later(rig, 0.5, interrupt))
-    characterisation, error = run(rig, steps=steps)
+    experiment = PressExperiment(rig, SHORT)
+    characterisation, error = run(rig, steps=steps, experiment=experiment)
     assert isinstance(error, NoContact)
     assert characterisation.interrupted
+    assert experiment.whereabouts.startswith(f"probe_stage stands at x {probe_um(rig):.1f} µm, y ")
+    assert experiment.whereabouts.endswith("; no contact was felt")
     assert probe_um(rig) > -410.0 + AWAY_UM
 
 
 def test_an_interruption_of_the_press_keeps_what_was_measured_and_takes_the_probe_away(rig):
     steps = Steps("pressing at", lambda: later(rig, 1.3, interrupt))
-    characterisation, error = run(rig, steps=steps)
+    experiment = PressExperiment(rig, SHORT)
+    characterisation, error = run(rig, steps=steps, experiment=experiment)
     assert error is None
     assert characterisation.interrupted
+    before_um = int(re.search(r"(\d+) µm before the contact$", experiment.whereabouts)[1])
+    assert AWAY_UM < before_um < AWAY_UM + 200
     assert len(characterisation.first.samples) > 30
     assert probe_um(rig) > -490.0 + AWAY_UM
 
@@ -157,6 +165,20 @@ def test_a_limit_that_ends_the_press_at_once_is_named(rig):
     assert "press slower than 40 µm/s" in error.remedy
     assert len(characterisation.first.frames) > 20
     assert probe_um(rig) > -490.0 + AWAY_UM
+
+
+def test_the_speed_that_a_guard_allows_is_kept_on_free_ways(rig, monkeypatch):
+    monkeypatch.setattr(type(rig.safety), "max_speed_um_s", lambda _self, _sensor: 300.0)
+    speeds_um_s = []
+    start = rig.devices["probe_stage"].start_move_to
+    monkeypatch.setattr(
+        type(rig.devices["probe_stage"]), "start_move_to",
+        lambda _self, **asked: speeds_um_s.append(asked["speed_um_s"]) or start(**asked),
+    )  # fmt: skip
+    steps = Steps("approach until contact", lambda: later(rig, 0.1, interrupt))
+    run(rig, steps=steps)
+    assert len(speeds_um_s) > SHORT.free_steps
+    assert max(speeds_um_s) == pytest.approx(300.0)
 
 
 def test_settings_that_cannot_be_are_refused(rig):

@@ -16,7 +16,7 @@ from microdrivers.core.contact_samples import (
 from microdrivers.core.errors import CalibrationError, DataError, MicrodriversError, NoContact
 from microdrivers.core.inbox import EstimatorHost, Inbox
 from microdrivers.core.samples import ForceSample, Frame, Sample
-from microdrivers.estimators.force.identify import Identification, identify
+from microdrivers.estimators.force.identify import Identification, IdentificationSettings, identify
 from microdrivers.estimators.force.indenter import IndentationEstimator
 from microdrivers.estimators.force.matcher import IndentationMatcher
 from microdrivers.estimators.force.model import SpecimenModel, slipped_um
@@ -75,8 +75,8 @@ class Characterisation:
     """Presses, identifies, and presses again with the sensor ignored.
 
     `first` and `check` hold what was measured even if `run` ends with an error, and `interrupted` tells whether it was
-    by Ctrl-C. `on_host` is told the estimators' inbox
-    of each indentation once it is there, for who records the order of arrival.
+    by Ctrl-C. `tells_nothing` is why `partial` found no specimen in it. `on_host` is told the estimators' inbox of each
+    indentation once it is there, for who records the order of arrival; `settings` say how to identify.
     """
 
     def __init__(
@@ -85,15 +85,18 @@ class Characterisation:
         *,
         keep_samples: bool = False,
         on_host: Callable[[str, Inbox], object] = lambda _name, _inbox: None,
+        settings: IdentificationSettings | None = None,
     ) -> None:
         self.first: Indentation | None = None
         self.check: Indentation | None = None
         self.interrupted = False
+        self.tells_nothing = ""
         self._record: IndentationRecord | None = None
         self._identification: Identification | None = None
         self._source = source
         self._keep_samples = keep_samples
         self._on_host = on_host
+        self._settings = settings
 
     def run(self, progress: Progress | None = None, *, check: bool = True) -> ForceRun:
         """Run it; on any way out the tool is away from the specimen.
@@ -128,7 +131,8 @@ class Characterisation:
             return None
         try:
             return self._found(error.what)
-        except (DataError, CalibrationError):
+        except (DataError, CalibrationError) as why:
+            self.tells_nothing = why.what
             return None
 
     def _experiment(self, progress: Progress, *, check: bool) -> None:
@@ -146,7 +150,7 @@ class Characterisation:
         assert self.first is not None
         if self._record is None or self._identification is None:
             self._record = record_of(self.first.frames)
-            self._identification = identify(self._record)
+            self._identification = identify(self._record, self._settings)
         source = self._source
         return ForceRun(
             not ended_by, ended_by, self.first, self._record, self._identification, self.check, source.setup(),

@@ -16,6 +16,7 @@ class IndentationPlayback:
     """Publishes a recorded indentation, once."""
 
     past_run = PastRun()
+    whereabouts = ""
 
     def __init__(self, table: IndentationTable) -> None:
         self.bus = Bus()

@@ -34,8 +34,6 @@ from microdrivers.routines.progress import Progress
 
 _LOOK_S = 0.05
 _AFTER_S = 0.5
-_SHARE_OF_LIMIT = 0.8
-"""Of the guard's limit, or of the sensor's range: where pressing ends by itself, before the guard must act."""
 _CONTACT_SIGMAS = 8.0
 _LEAST_CONTACT_UN = 1.0
 _CONTACT_READINGS = 3
@@ -69,28 +67,15 @@ class PressExperiment:
         self._sensor = rig.device(section.force, ForceSensor)
         self._camera = rig.device(section.camera, Camera)
         self._sight = sight or Sight()
-        self._limit_uN = self._force_limit_uN()
+        self._guard_uN = rig.safety.limit_uN(self._sensor.name)
+        self._limit_uN = self.settings.limit_uN(self._sensor.range_uN, guard_uN=self._guard_uN)
+        self._free_um_s = min(self.settings.free_speed_um_s, rig.safety.max_speed_um_s(self._sensor.name))
         self._way: ProbingWay | None = None
         self._contact_um = math.nan
         self._near = False
         self._indented = False
         self._watcher: FrameTracker | None = None
-
-    def _force_limit_uN(self) -> float:
-        ceiling = min(abs(self._sensor.range_uN.min), abs(self._sensor.range_uN.max))
-        guard = self._rig.safety.limit_uN(self._sensor.name)
-        if guard is not None:
-            ceiling = min(ceiling, guard)
-        asked = self.settings.max_force_uN
-        if asked is None:
-            return _SHARE_OF_LIMIT * ceiling
-        if not 0.0 < asked < ceiling:
-            what = "the guard's limit" if ceiling == guard else "the sensor's range"
-            raise OutOfRange(
-                f"a largest force of {asked:g} µN is not between 0 and {what}, {ceiling:g} µN",
-                remedy="press less, or change the safety section of the rig file",
-            )
-        return asked
+        self.whereabouts = ""
 
     # ------------------------------------------------------------------ before the indentation
 
@@ -100,7 +85,7 @@ class PressExperiment:
         if self._section.ready_um is not None:
             x_um, y_um, z_um = self._section.ready_um
             progress.step(f"probe to its place before the specimen, ({x_um:g}, {y_um:g}, {z_um:g}) µm")
-            self._stage.move_to(x_um=x_um, y_um=y_um, z_um=z_um, speed_um_s=self.settings.free_speed_um_s)
+            self._stage.move_to(x_um=x_um, y_um=y_um, z_um=z_um, speed_um_s=self._free_um_s)
         self._way = way = ProbingWay(self._stage, self._sensor, self._stage.read().position)
         progress.step("tare: the probe touches nothing")
         self._sensor.tare(self.settings.tare_s)
@@ -110,7 +95,7 @@ class PressExperiment:
         self._near = True
         self._contact_um = self._approach(way)
         progress.step(f"contact after {self._contact_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
-        self._go(way, self._contact_um - self.settings.back_off_um, self.settings.free_speed_um_s)
+        self._go(way, self._contact_um - self.settings.back_off_um, self._free_um_s)
         self.clock.sleep(self.settings.rest_s)
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
         ahead_um = self._contact_um - way.place_um(self._stage.read().position)
@@ -161,7 +146,7 @@ class PressExperiment:
         frames: list[Frame] = []
         places_um: list[float] = []
         for step in range(steps + 1):
-            self._go(way, -travel_um * (1.0 - step / steps), self.settings.free_speed_um_s)
+            self._go(way, -travel_um * (1.0 - step / steps), self._free_um_s)
             places_um.append(way.place_um(self._stage.read().position))
             frames.append(self._camera.grab())
             progress.count(step + 1, steps + 1)
@@ -209,11 +194,13 @@ class PressExperiment:
         assert self._way is not None
         way, asked = self._way, self.settings
         start_um, end_um = self._contact_um - asked.back_off_um, self._contact_um + asked.depth_um
-        self._go(way, start_um, asked.free_speed_um_s)
+        self._go(way, start_um, self._free_um_s)
         if self._indented:
             self._let_recover(progress)
         self._indented = True
-        progress.step(f"pressing at {asked.speed_um_s:g} µm/s, to {asked.depth_um:g} µm or {self._limit_uN:.0f} µN")
+        unguarded = "" if self._guard_uN is not None else "; NO FORCE GUARD watches (safety: none)"
+        to = f"to {asked.depth_um:g} µm or {self._limit_uN:.0f} µN{unguarded}"
+        progress.step(f"pressing at {asked.speed_um_s:g} µm/s, {to}")
         felt, lost = Felt(self._limit_uN, 1), Lost()
         total = round(2.0 * (end_um - start_um))
 
@@ -320,10 +307,17 @@ class PressExperiment:
         """Stop, and take the probe away if it may touch something; a guard that does so already is let finish."""
         self._rig.safety.finish()
         self._stage.stop(by="characterisation", reason="the experiment ended")
-        if self._near and self._stage.link == "open" and self._stage.retract_um is not None:
-            self._rest()
+        if self._way is None or self._stage.link != "open":
+            return
+        self._rest()
+        if self._near and self._stage.retract_um is not None:
             self._stage.retract().wait()
             self._near = False
+        position = self._stage.read().position
+        where = ", ".join(f"{axis} {um:.1f} µm" for axis, um in position.items())
+        before_um = self._contact_um - self._way.place_um(position)
+        contact = "no contact was felt" if math.isnan(before_um) else f"{before_um:.0f} µm before the contact"
+        self.whereabouts = f"{self._stage.name} stands at {where}; {contact}"
 
     def setup(self) -> IndentationSetup:
         """Names, speed, scale and zoom."""
@@ -333,6 +327,7 @@ class PressExperiment:
             scale_source=self._sight.source, scale_px_per_um=self._sight.scale_px_per_um,
             scale_sigma_px_per_um=self._sight.scale_sigma_px_per_um, zoom=self._zoom(),
             speed_um_s=self.settings.speed_um_s, tare_uN=None if tare is None else tare.offset_uN,
+            guarded=self._guard_uN is not None,
         )  # fmt: skip
 
     def _zoom(self) -> float | None:

@@ -12,6 +12,9 @@ SPEEDS_UM_S = Range(0.1, 100.0)
 DEPTHS_UM = Range(5.0, 1000.0)
 HOLDS_S = Range(0.0, 3600.0)
 
+_SHARE_OF_LIMIT = 0.8
+"""Of the guard's limit, or of the sensor's range."""
+
 
 class PressSettings(NamedTuple):
     """The experiment's figures; the speed is the paper's.
@@ -51,3 +54,25 @@ class PressSettings(NamedTuple):
                 raise OutOfRange(f"{name} is {value:g}", remedy="give a finite number that is not negative")
         if self.max_force_uN == 0.0:
             raise OutOfRange("max_force_uN is 0", remedy="give a largest force above 0 µN")
+
+    def limit_uN(self, range_uN: Range, *, guard_uN: float | None) -> float:
+        """The force at which pressing ends by itself, before a guard must act.
+
+        Args:
+            range_uN: of the sensor.
+            guard_uN: limit of its guard; None if it has none.
+
+        Raises:
+            OutOfRange: more is asked for than sensor or guard allow.
+        """
+        ceiling = min(abs(range_uN.min), abs(range_uN.max), math.inf if guard_uN is None else guard_uN)
+        asked = self.max_force_uN
+        if asked is None:
+            return _SHARE_OF_LIMIT * ceiling
+        if not 0.0 < asked < ceiling:
+            what = "the guard's limit" if ceiling == guard_uN else "the sensor's range"
+            raise OutOfRange(
+                f"a largest force of {asked:g} µN is not between 0 and {what}, {ceiling:g} µN",
+                remedy="press less, or change the safety section of the rig file",
+            )
+        return asked

@@ -35,6 +35,8 @@ class IndentationReplay:
         UnsupportedError: the recording holds no force characterisation.
     """
 
+    whereabouts = ""
+
     def __init__(self, recording: Recording) -> None:
         self.bus = Bus()
         self.clock: Clock = SimulatedClock()

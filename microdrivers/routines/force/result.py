@@ -14,6 +14,7 @@ from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.force_sensor import SATURATED
 from microdrivers.estimators.force.motion_limit import largest_speed_um_s
 from microdrivers.estimators.force.protocol_fit import ProtocolFit
+from microdrivers.estimators.force.record import IndentationRecord, saturated
 from microdrivers.estimators.force.vision_force import OUTSIDE_RANGE
 from microdrivers.results.force import (
     Contact,
@@ -38,7 +39,7 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
     found = run.identification
     best = found.protocols[found.best]
     check = compare(run.check) if run.check is not None else None
-    largest_uN = float(np.nanmax(run.record.force_uN))
+    largest_uN = float(np.nanmax(np.where(saturated(run.record), np.nan, run.record.force_uN)))
     return ForceResult(
         complete=run.complete,
         contact=Contact(
@@ -79,9 +80,13 @@ def compare(check: Indentation) -> VisionCheck | None:
     power = float(np.sqrt(np.mean(measured**2)))
     if not power > 0.0:
         return None
+    off = np.abs(seen - measured)
+    since_s = [(sample.t_ns - pairs[0][0].t_ns) / NS_PER_S for sample, _ in pairs]
     return VisionCheck(
-        error_percent=100.0 * float(np.sqrt(np.mean((seen - measured) ** 2))) / power,
-        largest_error_uN=float(np.max(np.abs(seen - measured))),
+        error_percent=100.0 * float(np.sqrt(np.mean(off**2))) / power,
+        largest_error_uN=float(np.max(off)),
+        largest_error_s=since_s[int(np.argmax(off))],
+        deepest_s=since_s[int(np.argmax([sample.deformation_um for sample, _ in pairs]))],
         samples=len(pairs),
         outside_range=sum(OUTSIDE_RANGE in force.flags for _, force in pairs),
     )
@@ -139,6 +144,7 @@ def _slip(run: ForceRun) -> SlipFit | None:
         rate_sigma_per_s=_known(slip.sigma_rate_per_s),
         not_returned_um=slip.not_returned_um,
         identifiable=slip.identifiable,
+        reason=slip.reason,
     )
 
 
@@ -163,6 +169,9 @@ def _excluded(run: ForceRun) -> dict[str, int]:
 
 def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
     known, drift = run.setup, run.first.drift
+    branches = run.identification.branches
+    in_um_s = _mean_speed_um_s(run.record, branches.loading) or best.fastest_um_s
+    out_um_s = _mean_speed_um_s(run.record, branches.unloading)
     return Setup(
         sensor=known.sensor,
         stage=known.stage,
@@ -171,13 +180,28 @@ def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
         scale_px_per_um=known.scale_px_per_um,
         scale_sigma_px_per_um=known.scale_sigma_px_per_um,
         zoom=known.zoom,
-        speed_um_s=best.fastest_um_s if known.speed_um_s is None else known.speed_um_s,
+        speed_um_s=in_um_s if known.speed_um_s is None else known.speed_um_s,
         deepest_um=best.deepest_um,
         largest_force_uN=largest_uN,
         tare_uN=known.tare_uN,
         image_drift_um_s=None if drift is None else drift.rate_um_s,
         image_drift_sigma_um_s=None if drift is None else drift.sigma_um_s,
+        unloading_speed_um_s=out_um_s if known.speed_um_s is None or out_um_s is None else known.speed_um_s,
+        pressed_um=float(np.nanmax(run.record.deformation_um)) - best.contact_um,
+        fastest_um_s=best.fastest_um_s,
+        fastest_unloading_um_s=best.fastest_unloading_um_s,
     )
+
+
+def _mean_speed_um_s(record: IndentationRecord, branch: range) -> float | None:
+    """Of the contact point over a branch; None if it was hardly seen there."""
+    seen = np.arange(branch.start, branch.stop)
+    seen = seen[np.isfinite(record.deformation_um[seen])]
+    if len(seen) < 2:
+        return None
+    first, last = seen[0], seen[-1]
+    way_um = record.deformation_um[last] - record.deformation_um[first]
+    return abs(float(way_um / (record.time_s[last] - record.time_s[first])))
 
 
 def _traces(run: ForceRun) -> ForceTraces:
@@ -216,6 +240,8 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
         notes.append(
             f"The model does not explain the record as fitted by {', '.join(beyond)}: do not quote its numbers."
         )
+    if not run.setup.guarded:
+        notes.append("No force guard watched over the indentation: the rig file's safety section states none.")
     if not run.complete:
         notes.append(f"The run ended early: {run.ended_by}. The result holds what had been measured until then.")
     notes += run.past_run.notes()

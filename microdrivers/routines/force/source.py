@@ -58,6 +58,7 @@ class IndentationSetup(NamedTuple):
         scale_source: where µm come from.
         speed_um_s: of the tool while loading.
         tare_uN: the sensor's zero that was in use.
+        guarded: whether a force guard of the rig watched.
     """
 
     sensor: str
@@ -69,6 +70,7 @@ class IndentationSetup(NamedTuple):
     zoom: float | None
     speed_um_s: float | None
     tare_uN: float | None
+    guarded: bool = True
 
 
 class IndentationSource(Protocol):
@@ -76,12 +78,14 @@ class IndentationSource(Protocol):
 
     Attributes:
         repeatable: whether `indent` may be called again, for a fresh indentation of the same specimen.
+        whereabouts: where the tool was observed to stand after `finish`, in words; empty if it never moved.
     """
 
     bus: Bus
     clock: Clock
     names: IndentationNames
     repeatable: bool
+    whereabouts: str
 
     @property
     def past_run(self) -> PastRun:

@@ -61,6 +61,7 @@ def test_slip_is_estimated_together_with_the_rest():
     found = identified("slip_corrected")
     assert found.slip is not None
     assert found.slip.identifiable
+    assert found.slip.reason == ""
     assert found.slip.offset_um == pytest.approx(25.0, abs=0.1)
     assert found.slip.rate_per_s == pytest.approx(0.1, rel=0.01)
     assert found.slip.not_returned_um == pytest.approx(25.0, abs=1.0)
@@ -78,6 +79,7 @@ def test_a_specimen_that_does_not_slip_gets_no_slip(preset):
     assert found.knots_s == 0.0
     assert found.slip is not None
     assert not found.slip.identifiable
+    assert f"{preset} explains the record without a slip" in found.slip.reason
 
 
 def test_an_effect_outside_the_model_is_said():
@@ -85,6 +87,18 @@ def test_an_effect_outside_the_model_is_said():
     assert found.misfit.found
     assert "misfit" in found.misfit.text
     assert all(fit.misfit.found and not fit.within_noise for fit in found.protocols.values())
+
+
+@pytest.mark.parametrize("depth_um", [20.0, 40.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_shallow_press_on_a_viscoelastic_specimen_is_no_slip(depth_um, seed):
+    """Until it is let go it looks like one; then its surface comes back."""
+    found = identify(recorded("viscoelastic", Push(depth_um=depth_um), seed=seed))
+    assert found.best != "slip_corrected"
+    assert found.misfit.found
+    assert not any(found.protocols[found.best].identifiable[name] for name in ("k1", "k2", "b"))
+    assert not found.slip.identifiable
+    assert "the surface came back by" in found.slip.reason
 
 
 def test_the_protocols_are_those_of_the_paper():

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,38 @@ def test_no_contact_is_told_from_a_weak_one(good):
 
 def test_a_force_of_the_wrong_sign_is_refused(good):
     refused(good._replace(force_uN=-good.force_uN), DataError, "pulls")
+
+
+@pytest.mark.parametrize("preset", ["real", "single", "slip_corrected", "viscoelastic"])
+def test_a_reversed_column_is_named(preset):
+    record = real() if preset == "real" else recorded(preset)
+    deformation, force = -record.deformation_um, -record.force_uN
+    refused(record._replace(deformation_um=deformation), DataError, "the deformation is reversed")
+    refused(record._replace(force_uN=force), DataError, "the specimen pulls")
+    refused(
+        record._replace(deformation_um=deformation, force_uN=force), DataError, "force and deformation are reversed"
+    )
+
+
+@pytest.mark.parametrize("preset", ["real", "single", "slip_corrected", "viscoelastic"])
+def test_two_indentations_are_told_apart(preset):
+    record = real() if preset == "real" else recorded(preset)
+    length_s = record.time_s[-1] - record.time_s[0] + 1.0 / 30.0
+    for times in (2, 3):
+        time_s = np.concatenate([record.time_s + n * length_s for n in range(times)])
+        many = IndentationRecord(time_s, np.tile(record.deformation_um, times), np.tile(record.force_uN, times))
+        refused(many, DataError, f"holds {times} indentations: it presses again after")
+        with pytest.raises(DataError) as caught:
+            check(many)
+        cut_s = float(re.search(r"cut it at ([\d.]+) s", caught.value.remedy)[1])
+        check(part(many, 0.0, cut_s))
+
+
+def test_a_force_that_falters_while_the_tool_goes_on_is_one_indentation(good):
+    force = good.force_uN.copy()
+    deep = int(0.8 * np.argmax(good.deformation_um))
+    force[deep : deep + 30] *= 0.05  # a membrane that gives way and is met again
+    check(good._replace(force_uN=force))
 
 
 def test_a_deformation_that_does_not_change_is_refused(good):

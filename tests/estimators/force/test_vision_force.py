@@ -260,6 +260,11 @@ def test_beyond_the_characterised_range_is_said() -> None:
         VisionForce(preset._replace(deepest_um=100.0, fastest_um_s=5.0)), frames(indentation(preset, hold_s=2.0))
     )
     assert not any(force.flags for force in same)
+    slow_back = preset._replace(deepest_um=200.0, fastest_unloading_um_s=3.0)
+    told = fed(VisionForce(slow_back), frames(record))
+    outside = [force.velocity_um_s for force in told if "OUTSIDE_RANGE" in force.flags]
+    assert len(outside) > 200
+    assert max(outside) < -3.0
 
 
 def test_uncertain_model_widens_sigma() -> None:
