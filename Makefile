@@ -27,7 +27,7 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 demo: $(READY)
-	@rm -f $(OUT)/run.mcap
+	@rm -f $(OUT)/run.mcap $(OUT)/result.json
 	$(BIN)/microdrivers calibrate optics --seed $(SEED) --out $(OUT)
 
 # Bytecode is kept whatever the environment says: pytest rewrites every assertion, a twentieth of the time.

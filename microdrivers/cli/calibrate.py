@@ -5,30 +5,42 @@ from __future__ import annotations
 import contextlib
 import shlex
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.exit_codes import EXIT_INTERRUPTED
 from microdrivers.cli.output import (
+    RESULT,
+    FiniteRange,
     RecordingChoice,
     describe_recorded,
     describe_rig,
+    exit_status,
+    given,
     prepare_folder,
     recorded_as,
+    recording_notes,
     recording_options,
     refuse_options_given,
     start_recording,
     tell_flaws,
+    write_results,
 )
 from microdrivers.cli.progress import TerminalProgress
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 
 if TYPE_CHECKING:
     from microdrivers.core.inbox import Inbox
+    from microdrivers.estimators.optics.calibrator import CalibratorSettings
     from microdrivers.recording.recorder import Recorder
     from microdrivers.routines.optics.source import OpticsSource
+
+OF_ANALYSIS = ("frames", "forgetting", "flush_frames", "drift_um_s")
+"""Options of the analysis: they may be tried on old data too."""
 
 
 @click.command(short_help="Camera to stage, through a zoom change.")
@@ -43,7 +55,25 @@ if TYPE_CHECKING:
 @click.option("--radius-um", type=float, help="Radius of the circle; default: up to 300, as large as fits the view.")
 @click.option("--zoom-to", type=float, default=1.2, show_default=True, help="Zoom after the change.")
 @click.option("--zoom-from", type=float, default=0.9, show_default=True, help="Zoom before the change.")
-@click.option("--frames", type=click.IntRange(min=10), default=100, show_default=True, help="Frames on the circle.")
+@click.option(
+    "--frames",
+    type=click.IntRange(min=10),
+    default=100,
+    show_default=True,
+    help="Frames on the circle; of old data, the first.",
+)
+@click.option(
+    "--forgetting", type=FiniteRange(0, 1, min_open=True), default=0.99, show_default=True,
+    help="λ of the estimator while the zoom rests; 1 forgets nothing.",
+)  # fmt: skip
+@click.option(
+    "--flush-frames", type=click.IntRange(min=2), default=3, show_default=True,
+    help="Frames with λ = 0 once the zoom has come to rest.",
+)  # fmt: skip
+@click.option(
+    "--drift-um-s", type=FiniteRange(min=0), default=0.005, show_default=True,
+    help="How fast the sample may drift against the stage; widens the intervals.",
+)  # fmt: skip
 @click.option("--settled/--in-motion", default=None, help="Take frames at rest, or never; default: as times are known.")
 @click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
 @click.option("--wire-log", type=click.Path(path_type=Path), metavar="FILE", help=WIRE_LOG_HELP)
@@ -61,6 +91,9 @@ def optics(
     zoom_to: float,
     zoom_from: float,
     frames: int,
+    forgetting: float,
+    flush_frames: int,
+    drift_um_s: float,
     settled: bool | None,
     real_time: bool,
     wire_log: Path | None,
@@ -80,21 +113,27 @@ def optics(
       microdrivers calibrate optics --rig lab.yaml --fake    the same rig, emulated
       microdrivers calibrate optics --images recording/      a recorded sequence
       microdrivers calibrate optics --replay runs/7/run.mcap what a run has recorded, again
+      microdrivers calibrate optics --replay runs/7/run.mcap --forgetting 0.95 --frames 80
     """
     from microdrivers.configs import shipped_rig
     from microdrivers.core.errors import ConfigError
+    from microdrivers.estimators.optics.calibrator import CalibratorSettings
 
     if images is not None and replay is not None:
         raise ConfigError("--images and --replay exclude each other", remedy="leave out one of them")
     if images is not None or replay is not None:
         option = "--images" if images is not None else "--replay"
-        refuse_options_given(f"{option} replaces the rig", allowed=("images", "replay", "out", "as_json"))
+        refuse_options_given(
+            f"{option} replaces the rig", allowed=("images", "replay", "out", "as_json"), of_analysis=OF_ANALYSIS
+        )
+    settings = CalibratorSettings(forgetting=forgetting, flush_frames=flush_frames, sigma_drift_um_s=drift_um_s)
+    first = frames if given("frames") else None
     progress = TerminalProgress(quiet=as_json)
     try:
         if images is not None:
-            complete = _from_images(images, out, as_json, progress)
+            status = _from_images(images, first, settings, out, as_json, progress)
         elif replay is not None:
-            complete = _from_recording(replay, out, as_json, progress)
+            status = _from_recording(replay, first, settings, out, as_json, progress)
         else:
             circle = {
                 "radius_um": radius_um,
@@ -104,42 +143,59 @@ def optics(
                 "settled": settled,
             }
             choice = RigChoice(rig_file or shipped_rig(), fake or rig_file is None, seed, world, wire_log)
-            complete = _on_rig(choice, out, circle, real_time, as_json, progress, recording=recording)
+            status = _on_rig(choice, out, circle, settings, real_time, as_json, progress, recording=recording)
     finally:
         progress.close()
-    if not complete:
+    if status == EXIT_INTERRUPTED:
         click.echo("interrupted: all axes were told to stop", err=True)
-        sys.exit(EXIT_INTERRUPTED)
+    if status:
+        sys.exit(status)
 
 
-def _from_images(folder: Path, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+def _from_images(
+    folder: Path,
+    frames: int | None,
+    settings: CalibratorSettings,
+    out: Path | None,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> int:
     from microdrivers.recording.image_sequence import ImageSequence
     from microdrivers.routines.optics import SequencePlayback
 
     sequence = ImageSequence(folder)
     provenance = {"source": f"image sequence {folder}", "clock": "recorded"}
-    return _run(SequencePlayback(sequence), provenance, out, as_json, progress)
+    return _run(SequencePlayback(sequence, frames=frames), settings, provenance, out, as_json, progress)
 
 
-def _from_recording(file: Path, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+def _from_recording(
+    file: Path,
+    frames: int | None,
+    settings: CalibratorSettings,
+    out: Path | None,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> int:
     from microdrivers.recording.reader import Recording
     from microdrivers.routines.optics import OpticsReplay
 
     with Recording(file) as recording:
         tell_flaws(recording)
-        return _run(OpticsReplay(recording), describe_recorded(recording), out, as_json, progress)
+        source = OpticsReplay(recording, frames=frames)
+        return _run(source, settings, describe_recorded(recording), out, as_json, progress)
 
 
 def _on_rig(
     choice: RigChoice,
     out: Path | None,
     circle: dict[str, Any],
+    estimator: CalibratorSettings,
     real_time: bool,
     as_json: bool,
     progress: TerminalProgress,
     *,
     recording: RecordingChoice | None,
-) -> bool:
+) -> int:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
     from microdrivers.routines.optics import CircleExperiment, CircleSettings
@@ -154,18 +210,19 @@ def _on_rig(
     ):
         settings = CircleSettings(**circle)
         provenance = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict())
-        return _run(CircleExperiment(rig, settings), provenance, out, as_json, progress, recording=recording)
+        return _run(CircleExperiment(rig, settings), estimator, provenance, out, as_json, progress, recording=recording)
 
 
 def _run(
     source: OpticsSource,
+    settings: CalibratorSettings,
     known: dict[str, Any],
     out: Path | None,
     as_json: bool,
     progress: TerminalProgress,
     *,
     recording: RecordingChoice | None = None,
-) -> bool:
+) -> int:
     from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import CalibrationError
     from microdrivers.report.optics_report import write_optics_report
@@ -176,7 +233,7 @@ def _run(
     from microdrivers.routines.provenance import describe_run
 
     out = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics"
-    folder = prepare_folder(out, new=known["clock"] == "recorded")
+    folder = prepare_folder(out)
     truth = OpticsTruthCollector(source.bus)
     recorder: Recorder | None = None
 
@@ -189,11 +246,11 @@ def _run(
             recorder = stack.enter_context(
                 start_recording(folder, recording, bus=source.bus, clock=source.clock, known=known)
             )
-        run = calibrate_optics(source, progress=progress, on_host=follow)
+        run = calibrate_optics(source, settings=settings, progress=progress, on_host=follow)
     if not run.estimates and not run.complete:
         click.echo("nothing had been measured yet", err=True)
-        return False
-    known["settings"] = known.get("settings", {}) | run.settings._asdict()
+        return EXIT_INTERRUPTED
+    known["settings"] = known.get("settings", {}) | run.settings._asdict() | {"frames": source.frames_expected()}
     command = shlex.join(["microdrivers", *sys.argv[1:]])
     try:
         result = build_result(run, describe_run(known, command=command, now=utc_now()))
@@ -201,17 +258,21 @@ def _run(
         if run.complete:
             raise
         click.echo(f"too little had been measured for a result: {error.what}", err=True)
-        return False
-    result = result.model_copy(update={"truth": truth.compare(result, run.estimates)})
-    folder.mkdir(parents=True, exist_ok=True)
-    result.write_json(folder / "result.json")
-    result.write_calibration(folder / "calibration.yaml")
+        return EXIT_INTERRUPTED
+    notes = [*result.notes, *recording_notes(recorder)]
+    result = result.model_copy(update={"truth": truth.compare(result, run.estimates), "notes": notes})
     progress.step("drawing the report")
-    write_optics_report(result, folder / "report.html")
+    files: dict[str, Callable[[Path], object]] = {
+        RESULT: result.write_json,
+        "calibration.yaml": result.write_calibration,
+        "report.html": partial(write_optics_report, result),
+    }
+    written = write_results(folder, files)
     progress.close()
     if as_json:
-        click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
+        click.echo(result.as_json(), nl=False)
     else:
         click.echo(optics_summary(result))
-        click.echo(f"\nwritten to {folder}/: result.json, calibration.yaml, report.html{recorded_as(recorder)}")
-    return run.complete
+        if written:
+            click.echo(f"\nwritten to {folder}/: {', '.join(files)}{recorded_as(recorder)}")
+    return exit_status(recorder, complete=run.complete, written=written)

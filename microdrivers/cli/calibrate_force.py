@@ -5,34 +5,44 @@ from __future__ import annotations
 import contextlib
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.main import EXIT_INTERRUPTED
 from microdrivers.cli.output import (
+    RESULT,
     RecordingChoice,
     describe_recorded,
     describe_rig,
+    exit_status,
     prepare_folder,
     recorded_as,
+    recording_notes,
     recording_options,
     refuse_options_given,
     start_recording,
     tell_flaws,
+    write_results,
 )
 from microdrivers.cli.progress import TerminalProgress
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 
 if TYPE_CHECKING:
     from microdrivers.core.inbox import Inbox
+    from microdrivers.estimators.force.identify import IdentificationSettings
+    from microdrivers.estimators.force.protocols import ProtocolName
     from microdrivers.recording.recorder import Recorder
     from microdrivers.report.force_truth import ContactTruthCollector
     from microdrivers.results.force import ForceResult
     from microdrivers.routines.force import Characterisation, ForceRun, IndentationSource
 
+RECORD = "record.csv"
+PROTOCOLS = ("single", "unloading_springs", "loading_only", "slip_corrected", "loading")
+OF_ANALYSIS = ("leave_out", "protocol")
+"""Options of the analysis: they may be tried on old data too."""
 _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else in its way?"
 
 
@@ -46,11 +56,16 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
 @click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimators on what it recorded.")
 @recording_options
 @click.option("--calibration", type=click.Path(path_type=Path), help="result.json of `calibrate optics` for µm.")
-@click.option("--depth-um", type=float, default=110.0, show_default=True, help="How far to press.")
+@click.option("--depth-um", type=float, default=110.0, show_default=True, help="How far to press, 5 to 1000.")
 @click.option("--max-force-uN", "max_force_uN", type=float, help="Where to turn back; default: 80 % of the limit.")
-@click.option("--speed-um-s", type=float, default=5.0, show_default=True, help="Of the probe, in and out.")
+@click.option("--speed-um-s", type=float, default=5.0, show_default=True, help="Of the probe, in and out, 0.1 to 100.")
 @click.option("--hold-s", type=click.FloatRange(min=0.0), default=0.0, show_default=True, help="Wait when deepest.")
 @click.option("--check/--no-check", default=True, show_default=True, help="Press again, force from the camera alone.")
+@click.option(
+    "--leave-out", type=click.IntRange(0, 20), default=2, show_default=True,
+    help="Samples not fitted on either side of contact, reversals and release.",
+)  # fmt: skip
+@click.option("--protocol", type=click.Choice(PROTOCOLS), help="Whose model counts; default: the one that fits best.")
 @click.option("--yes", is_flag=True, help="Do not ask whether specimen and probe are ready.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-force/.")
 @click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
@@ -68,6 +83,8 @@ def force(
     calibration: Path | None,
     yes: bool,
     check: bool,
+    leave_out: int,
+    protocol: ProtocolName | None,
     out: Path | None,
     real_time: bool,
     wire_log: Path | None,
@@ -89,33 +106,45 @@ def force(
       microdrivers calibrate force --rig lab.yaml --fake          the same rig, emulated
       microdrivers calibrate force --csv indentation.csv          time_s, indentation_um, force_uN
       microdrivers calibrate force --replay runs/7/run.mcap       what a run has recorded, again
+      microdrivers calibrate force --replay runs/7/run.mcap --protocol loading --leave-out 5
     """
     from microdrivers.configs import shipped_rig
+    from microdrivers.estimators.force.identify import IdentificationSettings
 
+    settings = IdentificationSettings(around_reversal=leave_out, protocol=protocol)
     progress = TerminalProgress(quiet=as_json)
     try:
         if table is not None or replay is not None:
             _refuse_rig_options(table, replay)
         if table is not None:
-            complete = _from_table(table, specimen, out, as_json, progress)
+            status = _from_table(table, specimen, settings, out, as_json, progress)
         elif replay is not None:
-            complete = _from_recording(replay, check, out, as_json, progress)
+            status = _from_recording(replay, check, settings, out, as_json, progress)
         else:
             _check_figures(press)
             emulated = fake or rig_file is None
             if not emulated and not yes:
-                click.confirm(_QUESTION, abort=True, err=True)
+                _ask(rig_file or shipped_rig())
             overrides = {"specimen": {"preset": specimen}} if emulated and specimen is not None else None
             choice = RigChoice(rig_file or shipped_rig(), emulated, seed, world, wire_log)
-            complete = _on_rig(
-                choice, specimen, overrides, calibration, press, check, out, real_time, as_json, progress,
+            status = _on_rig(
+                choice, specimen, overrides, calibration, press, check, settings, out, real_time, as_json, progress,
                 recording=recording,
             )  # fmt: skip
     finally:
         progress.close()
-    if not complete:
-        click.echo("interrupted: the probe was told to stop and taken away from the specimen", err=True)
-        sys.exit(EXIT_INTERRUPTED)
+    if status:
+        sys.exit(status)
+
+
+def _ask(rig_file: Path) -> None:
+    """Have the operator confirm; a rig file that is wrong, or states no force guard, is told before."""
+    from microdrivers.rig import load_rig_file
+
+    rig = load_rig_file(rig_file).rig
+    if rig.probe is not None and rig.probe.force not in {guard.sensor for guard in rig.safety.force_guards}:
+        click.echo(f"no force guard watches {rig.probe.force}: the rig file's safety section states none", err=True)
+    click.confirm(_QUESTION, abort=True, err=True)
 
 
 def _check_figures(press: dict[str, Any]) -> None:
@@ -131,24 +160,42 @@ def _refuse_rig_options(table: Path | None, replay: Path | None) -> None:
     if table is not None and replay is not None:
         raise ConfigError("--csv and --replay exclude each other", remedy="leave out one of them")
     option, of_its_own = ("--csv", "specimen") if table is not None else ("--replay", "check")
-    refuse_options_given(f"{option} replaces the rig", allowed=("table", "replay", "out", "as_json", "yes", of_its_own))
+    refuse_options_given(
+        f"{option} replaces the rig", allowed=("table", "replay", "out", "as_json", "yes", of_its_own),
+        of_analysis=OF_ANALYSIS,
+    )  # fmt: skip
 
 
-def _from_recording(file: Path, check: bool, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+def _from_recording(
+    file: Path,
+    check: bool,
+    settings: IdentificationSettings,
+    out: Path | None,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> int:
     from microdrivers.recording.reader import Recording
     from microdrivers.routines.force import IndentationReplay
 
     with Recording(file) as recording:
         tell_flaws(recording)
-        return _run(IndentationReplay(recording), describe_recorded(recording), check, out, as_json, progress)
+        known = describe_recorded(recording)
+        return _run(IndentationReplay(recording), known, check, settings, out, as_json, progress)
 
 
-def _from_table(file: Path, specimen: str | None, out: Path | None, as_json: bool, progress: TerminalProgress) -> bool:
+def _from_table(
+    file: Path,
+    specimen: str | None,
+    settings: IdentificationSettings,
+    out: Path | None,
+    as_json: bool,
+    progress: TerminalProgress,
+) -> int:
     from microdrivers.recording.indentation_table import IndentationTable
     from microdrivers.routines.force import IndentationPlayback
 
     known = {"source": f"recorded indentation {file}", "clock": "recorded", "settings": {"specimen": specimen}}
-    return _run(IndentationPlayback(IndentationTable(file)), known, False, out, as_json, progress)
+    return _run(IndentationPlayback(IndentationTable(file)), known, False, settings, out, as_json, progress)
 
 
 def _on_rig(
@@ -158,13 +205,14 @@ def _on_rig(
     calibration: Path | None,
     press: dict[str, Any],
     check: bool,
+    identification: IdentificationSettings,
     out: Path | None,
     real_time: bool,
     as_json: bool,
     progress: TerminalProgress,
     *,
     recording: RecordingChoice | None,
-) -> bool:
+) -> int:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
     from microdrivers.routines.force import PressExperiment, PressSettings, Sight
@@ -183,7 +231,8 @@ def _on_rig(
         sight = Sight.calibrated(rig, calibration) if calibration is not None else Sight()
         known = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict() | {"specimen": specimen})
         source = PressExperiment(rig, settings, sight=sight)
-        return _run(source, known, check, out, as_json, progress, recording=recording)
+        recording = recording and recording._replace(calibration=calibration)
+        return _run(source, known, check, identification, out, as_json, progress, recording=recording)
 
 
 @contextlib.contextmanager
@@ -204,12 +253,13 @@ def _run(
     source: IndentationSource,
     known: dict[str, Any],
     check: bool,
+    settings: IdentificationSettings,
     out: Path | None,
     as_json: bool,
     progress: TerminalProgress,
     *,
     recording: RecordingChoice | None = None,
-) -> bool:
+) -> int:
     from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import MicrodriversError
     from microdrivers.report.force_summary import force_summary
@@ -217,7 +267,8 @@ def _run(
     from microdrivers.routines.force import Characterisation
 
     out = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force"
-    folder = prepare_folder(out, new=known["clock"] == "recorded")
+    folder = prepare_folder(out)
+    known["settings"] = known.get("settings", {}) | settings._asdict()
     truth = ContactTruthCollector(source.bus)
     recorder: Recorder | None = None
 
@@ -230,59 +281,73 @@ def _run(
             recorder = stack.enter_context(
                 start_recording(folder, recording, bus=source.bus, clock=source.clock, known=known)
             )
-        characterisation = Characterisation(source, on_host=follow)
+        characterisation = Characterisation(source, on_host=follow, settings=settings)
         try:
             run = characterisation.run(progress, check=check)
         except MicrodriversError as error:
-            if known["clock"] != "recorded":
-                _keep(characterisation, folder)
-            partial = characterisation.partial(error)
-            if partial is not None:
-                _write(partial, known, truth, folder, progress)
+            found = characterisation.partial(error)
+            measured = _measured(characterisation)
+            if measured and known["clock"] != "recorded" and write_results(folder, measured):
+                click.echo(_what_to_do_with(folder / RECORD, characterisation.tells_nothing), err=True)
+            click.echo(source.whereabouts, nl=bool(source.whereabouts), err=True)
+            if found is not None and write_results(folder, _files(_result(found, known, truth, recorder), progress)):
+                progress.close()
                 click.echo(f"what it says of the specimen is in {folder}/: result.json, report.html", err=True)
             if characterisation.interrupted:
                 raise KeyboardInterrupt from error
             raise
-    result = _write(run, known, truth, folder, progress)
-    _keep(characterisation, folder, say=False)
+    result = _result(run, known, truth, recorder)
+    files = _measured(characterisation) | _files(result, progress)
+    written = write_results(folder, files)
+    progress.close()
     if as_json:
-        click.echo((folder / "result.json").read_text(encoding="utf-8"), nl=False)
+        click.echo(result.as_json(), nl=False)
     else:
         click.echo(force_summary(result))
-        files = f"result.json, specimen.yaml, record.csv, report.html{recorded_as(recorder)}"
-        click.echo(f"\nwritten to {folder}/: {files}")
-    return not characterisation.interrupted
+        if written:
+            click.echo(f"\nwritten to {folder}/: {', '.join(files)}{recorded_as(recorder)}")
+    if characterisation.interrupted:
+        click.echo(f"interrupted; {source.whereabouts or 'the result is from what had been published'}", err=True)
+    return exit_status(recorder, complete=not characterisation.interrupted, written=written)
 
 
-def _write(
-    run: ForceRun, known: dict[str, Any], truth: ContactTruthCollector, folder: Path, progress: TerminalProgress
+def _what_to_do_with(record: Path, tells_nothing: str) -> str:
+    """What an experiment that failed has measured, and how it is analysed, unless it says nothing of a specimen."""
+    if tells_nothing:
+        return f"what was measured is in {record}; nothing follows from it: {tells_nothing}"
+    command = shlex.join(["microdrivers", "calibrate", "force", "--csv", str(record)])
+    return f"what was measured is in {record}; to analyse it: {command}"
+
+
+def _result(
+    run: ForceRun, known: dict[str, Any], truth: ContactTruthCollector, recorder: Recorder | None
 ) -> ForceResult:
-    """Write result.json, specimen.yaml and report.html."""
+    """What the run says of the specimen; with what its recording lacks, and the truth if it was simulated."""
     from microdrivers.core.clock import utc_now
-    from microdrivers.report.force_report import write_force_report
     from microdrivers.routines.force import build_result
     from microdrivers.routines.provenance import describe_run
 
     command = shlex.join(["microdrivers", *sys.argv[1:]])
     result = build_result(run, describe_run(known, command=command, now=utc_now()))
-    result = result.model_copy(update={"truth": truth.compare(result, run.first.deformations)})
-    folder.mkdir(parents=True, exist_ok=True)
-    result.write_json(folder / "result.json")
-    result.write_specimen(folder / "specimen.yaml")
-    progress.step("drawing the report")
-    write_force_report(result, folder / "report.html")
-    progress.close()
-    return result
+    notes = [*result.notes, *recording_notes(recorder)]
+    return result.model_copy(update={"truth": truth.compare(result, run.first.deformations), "notes": notes})
 
 
-def _keep(characterisation: Characterisation, folder: Path, *, say: bool = True) -> None:
-    """Write down what has been measured, also of an experiment that failed."""
+def _files(result: ForceResult, progress: TerminalProgress) -> dict[str, Callable[[Path], object]]:
+    """What writes the files of a result."""
+    from microdrivers.report.force_report import write_force_report
+
+    def draw(file: Path) -> None:
+        progress.step("drawing the report")
+        write_force_report(result, file)
+
+    return {RESULT: result.write_json, "specimen.yaml": result.write_specimen, "report.html": draw}
+
+
+def _measured(characterisation: Characterisation) -> dict[str, Callable[[Path], object]]:
+    """What writes down what has been measured, also of an experiment that failed; nothing if nothing has."""
     from microdrivers.recording.indentation_table import write_indentation_table
 
     if characterisation.first is None or not characterisation.first.frames:
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / "record.csv"
-    write_indentation_table(file, characterisation.first.frames)
-    if say:
-        click.echo(f"what was measured is in {file}; to analyse it: calibrate force --csv {file}", err=True)
+        return {}
+    return {RECORD: partial(write_indentation_table, samples=characterisation.first.frames)}

@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from microdrivers import __version__
+from microdrivers.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
     from microdrivers.core.errors import MicrodriversError
 
-EXIT_ERROR = 1
-EXIT_INTERRUPTED = 130
-
 SERVED = "microdrivers.served"
 """In a command's context: whether its devices are emulated by another program."""
+
+AS_JSON = "microdrivers.as_json"
+"""In a command's context: whether its standard output is read by another program."""
 
 _SERVED_HINT = (
     "these devices are emulated: see that `microdrivers serve` runs, and that this computer is not too busy for it"
@@ -40,6 +41,10 @@ class CommandLine(click.Group):
         except MicrodriversError as error:
             if ctx.params.get("debug"):
                 raise
+            if ctx.meta.get(AS_JSON):
+                from microdrivers.cli.output import error_as_json
+
+                click.echo(error_as_json(error))
             click.secho("error: ", fg="red", bold=True, nl=False, err=True)
             click.echo(str(error), err=True)
             if ctx.meta.get(SERVED) and _may_be_the_servers(error):
@@ -122,7 +127,9 @@ class _LazyCommand(click.Command):
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
-        return self._real().make_context(info_name, args, parent, **extra)
+        context = self._real().make_context(info_name, args, parent, **extra)
+        context.meta[AS_JSON] = bool(context.params.get("as_json"))
+        return context
 
     def get_short_help_str(self, limit: int = 45) -> str:  # noqa: ARG002 - click's signature
         return self.short_help or ""

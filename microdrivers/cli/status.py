@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.main import EXIT_ERROR
+from microdrivers.cli.exit_codes import EXIT_ERROR
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:

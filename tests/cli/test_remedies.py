@@ -119,7 +119,7 @@ def test_serve_says_how_others_reach_a_bus_and_that_they_take_turns(run, can_fil
     assert result.exit_code == 0, result.output
     (line,) = [line for line in result.stdout.splitlines() if "serial CAN adapter" in line]
     assert "one program at a time has it, with all devices on its bus (probe_stage, probe_force)" in line
-    channel = result.stdout.splitlines()[0].split()[1]
+    channel = result.stdout.splitlines()[1].split()[1]
     assert f"can.Bus(interface='slcan', channel='{channel}', bitrate=500000)" in line
 
 
