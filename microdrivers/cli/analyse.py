@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from microdrivers.cli.main import EXIT_ERROR, EXIT_INTERRUPTED
+from microdrivers.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED
 from microdrivers.cli.progress import TerminalProgress
 
 

@@ -74,6 +74,7 @@ def describe(recording: Recording) -> dict[str, Any]:
         "arrivals": {host: len(orders) for host, orders in recording.arrivals.items()},
         "attachments": {name: len(data) for name, data in recording.attachments.items()},
         "losses": lost,
+        "damaged_indexes": [str(damage) for damage in recording.check_indexes()],
     }
 
 
@@ -108,6 +109,9 @@ def _as_text(found: dict[str, Any]) -> str:
             "  estimators " + ", ".join(f"{host} ({number} samples)" for host, number in found["arrivals"].items())
         )
     lines += ["", *(f"  lost       {loss}" for loss in found["losses"] or ["nothing"])]
+    lines += [f"  damaged    {damage}" for damage in found["damaged_indexes"]]
+    if found["damaged_indexes"]:
+        lines.append("             other programs may misread it; `microdrivers recording repair` makes it anew")
     return "\n".join(lines)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-import os
+import shutil
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.main import EXIT_ERROR
+from microdrivers.cli.exit_codes import EXIT_ERROR
 from microdrivers.cli.output import COMPRESSION_HELP, topic_patterns
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LINE_PERIOD_S = 1.0
 _PLAIN_LINE_PERIOD_S = 10.0
+_HOUR_S, _DAY_S = 3600.0, 86400.0
 
 
 def _finite(_context: click.Context, _parameter: click.Parameter, duration_s: float | None) -> float | None:
@@ -101,7 +102,6 @@ def record(
             out or _default_file(rig), bus=rig.bus, clock=rig.clock, header=header, topics=patterns,
             on_failure="stop" if on_failure == "stop" else "go_on", compress_images=compress_images,
         )  # fmt: skip
-        made = recorder.file.stat()
     except BaseException:
         rig.close()
         raise
@@ -115,21 +115,13 @@ def record(
             _run(rig.clock, recorder, duration_s)
     except KeyboardInterrupt:
         ended_by_user = True
-    gone = not _is_still(made, recorder.file)
-    _tell(recorder, interrupted=ended_by_user, gone=gone)
+    disturbance = recorder.disturbance
+    _tell(recorder, interrupted=ended_by_user, disturbance=disturbance)
     unmet = _unmet(patterns or (), rig.bus.topics)
     if unmet:
         click.echo(f"there was no topic {_quoted(unmet)}: {_similar(unmet, rig.bus.topics)}", err=True)
-    if gone or unmet or any(count.dropped for count in recorder.counts.values()):
+    if disturbance or unmet or recorder.dropped or recorder.failure is not None:
         sys.exit(EXIT_ERROR)
-
-
-def _is_still(made: os.stat_result, file: Path) -> bool:
-    """Whether that file is the one that was made."""
-    try:
-        return os.path.samestat(made, file.stat())
-    except OSError:
-        return False
 
 
 def _unmet(patterns: Collection[str], topics: Collection[str]) -> list[str]:
@@ -182,7 +174,8 @@ def _run(clock: Clock, recorder: Recorder, duration_s: float | None) -> None:
             clock.sleep(min(period_s, end_s - elapsed_s))
             now_ns = clock.now_ns()
             messages = {topic: count.messages for topic, count in recorder.counts.items()}
-            line = _line(recorder, messages, before, (now_ns - before_ns) / 1e9, (now_ns - begin_ns) / 1e9)
+            width = shutil.get_terminal_size().columns - 1 if live else sys.maxsize
+            line = _line(recorder, messages, before, (now_ns - before_ns) / 1e9, (now_ns - begin_ns) / 1e9, width)
             click.echo(f"\r\x1b[2K{line}" if live else line, nl=not live, err=True)
             before, before_ns = messages, now_ns
     finally:
@@ -191,24 +184,48 @@ def _run(clock: Clock, recorder: Recorder, duration_s: float | None) -> None:
 
 
 def _line(
-    recorder: Recorder, messages: Mapping[str, int], before: Mapping[str, int], period_s: float, elapsed_s: float
+    recorder: Recorder,
+    messages: Mapping[str, int],
+    before: Mapping[str, int],
+    period_s: float,
+    elapsed_s: float,
+    width: int,
 ) -> str:
+    """How it goes, in at most so many columns: a line that is wrapped is not written over."""
+    from microdrivers.recording.channels import TRUTH_PREFIX
+
     rates = " · ".join(
         f"{topic} {(number - before.get(topic, 0)) / period_s:.0f}/s"
-        for topic, number in messages.items()
+        for topic, number in sorted(messages.items(), key=lambda item: item[0].startswith(TRUTH_PREFIX))
         if number > before.get(topic, 0)
     )
-    dropped = sum(count.dropped for count in recorder.counts.values())
-    lost = click.style(f"{dropped} dropped", fg="red", bold=True) if dropped else "0 dropped"
-    return f"{elapsed_s:.0f} s | {recorder.size / 1e6:.1f} MB | {lost} | {rates or 'nothing'}"
+    dropped = f"{recorder.dropped} dropped"
+    begin = f"{elapsed_s:.0f} s | {recorder.size / 1e6:.1f} MB{_room(recorder, elapsed_s)} | "
+    rest = _cut(f" | {rates or 'nothing'}", width - len(begin) - len(dropped))
+    return begin + (click.style(dropped, fg="red", bold=True) if recorder.dropped else dropped) + rest
 
 
-def _tell(recorder: Recorder, *, interrupted: bool, gone: bool) -> None:
+def _room(recorder: Recorder, elapsed_s: float) -> str:
+    """For how much longer the disk has room, at the mean rate so far; nothing if that is more than a day."""
+    try:
+        left_s = shutil.disk_usage(recorder.file.parent).free * elapsed_s / recorder.size
+    except OSError:  # the folder is gone: the end tells
+        return ""
+    if left_s > _DAY_S:
+        return ""
+    return f", room for {left_s:.0f} s" if left_s < _HOUR_S else f", room for {left_s / _HOUR_S:.1f} h"
+
+
+def _cut(text: str, width: int) -> str:
+    return text if len(text) <= width else text[: max(width - 1, 0)] + "…"
+
+
+def _tell(recorder: Recorder, *, interrupted: bool, disturbance: str) -> None:
     how = "ended by you; the file is complete" if interrupted else "complete"
     if recorder.failure is not None:
         how = f"could not be written all the time: {recorder.failure.strerror or recorder.failure}"
-    if gone:
-        how = "gone: while it was written somebody has removed, renamed or replaced it, or its disk"
+    if disturbance:
+        how = f"spoilt: while it was written {disturbance}"
     click.echo(f"{recorder.file}: {recorder.size / 1e6:.1f} MB, {how}")
     width = max(map(len, recorder.counts), default=0)
     for topic, count in recorder.counts.items():

@@ -24,17 +24,13 @@ def repair(file: Path, out: Path | None) -> None:
     from microdrivers.recording.repair import repair as write_repaired
 
     target = out or file.with_name(f"{file.stem}.repaired.mcap")
-    existed = target.exists()
-    try:
-        report = write_repaired(file, target)
-    except KeyboardInterrupt:
-        if not existed:
-            target.unlink(missing_ok=True)
-        raise
+    report = write_repaired(file, target)
     click.echo(f"{report.out}: {sum(report.messages.values())} messages kept")
     width = max(map(len, report.messages), default=0)
     for topic, number in report.messages.items():
         click.echo(f"  {topic:<{width}}  {number}")
+    for damage in report.mended:
+        click.echo(f"mended: {damage}")
     if not report.losses:
         click.echo("nothing was lost")
         return

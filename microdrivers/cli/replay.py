@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from microdrivers.cli.main import EXIT_INTERRUPTED
+from microdrivers.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED
 from microdrivers.cli.output import tell_flaws
 from microdrivers.cli.progress import TerminalProgress
 
@@ -68,6 +68,9 @@ def replay(file: Path, speed: float | None) -> None:
     finally:
         progress.close()
         clock.close()
+    if not total:
+        click.echo(f"{file} holds no samples: nothing was recorded in it, or nothing can be read", err=True)
+        sys.exit(EXIT_ERROR)
     if interrupted:
         click.echo("interrupted", err=True)
         sys.exit(EXIT_INTERRUPTED)

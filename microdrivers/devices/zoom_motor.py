@@ -7,6 +7,7 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal
 
 import msgspec
@@ -124,8 +125,13 @@ class ZoomMotor(Device[ZoomSample]):
         self._check(zoom)
         latest = self.topic.latest if self.streaming else None
         start = latest if latest is not None else self.read()
-        self._publish_rest_until_now(start)
-        return self._command(self.curve.steps_at(zoom), start.position_steps)
+        rest = self._rest_until_now(start)
+        # Another's poll may be on the line, with an older reading: it goes before, in number and in time.
+        with self.clock.transaction():
+            move = self._command(self.curve.steps_at(zoom), start.position_steps)
+            if rest is not None:
+                self.clock.deliver(partial(self._publish_rest, msgspec.structs.replace(rest, seq=self._next_seq())))
+        return move
 
     def reference(self) -> None:
         """Find the reference. Moves the motor."""
@@ -154,15 +160,18 @@ class ZoomMotor(Device[ZoomSample]):
                     remedy="make sure that the way is free, then reference()",
                 )
 
-    def _publish_rest_until_now(self, latest: ZoomSample) -> None:
+    def _rest_until_now(self, latest: ZoomSample) -> ZoomSample | None:
         """A motor that rested rests until it is commanded: samples before and after leave the instant open."""
         if latest.moving or latest.t_ns <= self._commanded_ns:
-            return
-        self.topic.publish(
-            msgspec.structs.replace(
-                latest, t_ns=self.clock.now_ns(), dt_ns=0, t_source="computed", seq=self._next_seq(), order=-1
-            )
-        )
+            return None
+        return msgspec.structs.replace(latest, t_ns=self.clock.now_ns(), dt_ns=0, t_source="computed", order=-1)
+
+    def _publish_rest(self, rest: ZoomSample) -> None:
+        newest = self.topic.latest
+        if newest is None or newest.t_ns < rest.t_ns:
+            self.topic.publish(rest)
+        elif not newest.moving:  # it was read before the command was sent, and the motor rested on
+            self.topic.publish(msgspec.structs.replace(rest, t_ns=newest.t_ns + 1))
 
     def _command(self, target_steps: int, start_steps: int) -> Move[ZoomSample]:
         with self._naming_errors():

@@ -13,6 +13,7 @@ from microdrivers.core.samples import Frame
 from microdrivers.core.units import NS_PER_S
 from microdrivers.recording.channels import literal
 from microdrivers.recording.export.pictures import eight_bit
+from microdrivers.recording.output import refuse_existing, whole_file
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.views import start_ns
 
@@ -32,9 +33,13 @@ def write_contact_sheet(recording: Recording, file: Path, *, frames: int = 12, c
         how many frames it shows.
 
     Raises:
-        UnsupportedError: the recording has no frames. ConfigError: the file exists, or cannot be written.
+        UnsupportedError: the recording has no frames. ConfigError: the file exists, cannot be written, or is no .png.
     """
     import cv2
+
+    refuse_existing(file, "a contact sheet")
+    if file.suffix.lower() != ".png":
+        raise ConfigError("the name of a contact sheet must end in .png", file=str(file), remedy="rename it")
 
     cameras = {name: found for name, found in recording.topics.items() if found.sample_type is Frame and found.count}
     if not cameras:
@@ -56,12 +61,8 @@ def write_contact_sheet(recording: Recording, file: Path, *, frames: int = 12, c
     done, data = cv2.imencode(".png", np.vstack(blocks))
     assert done
     try:
-        file.touch(exist_ok=False)
-        try:
-            file.write_bytes(data.tobytes())
-        except BaseException:
-            file.unlink()  # half a picture is none
-            raise
+        with whole_file(file) as part:
+            part.write_bytes(data.tobytes())
     except OSError as error:
         raise ConfigError(
             f"the contact sheet cannot be written: {error.strerror}", file=str(file), remedy="choose another new file"

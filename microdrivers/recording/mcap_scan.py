@@ -22,10 +22,11 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
-from microdrivers.recording.mcap_writer import CHUNK, MAGIC, RECORD
+from microdrivers.recording.mcap_writer import CHUNK, MAGIC, MESSAGE, RECORD
 
 NOT_ENDED = "the recording was not ended: its last 0.1 s may be missing"
 
+_NO_SUMMARY = "the file's summary is damaged or cut off, or something follows it"
 _INDEX = struct.Struct("<BQHI")
 _FOOTER_SIZE = 29
 _BLOCK_BYTES = 1 << 20
@@ -80,7 +81,7 @@ class McapScan:
 
     Attributes:
         profile: of the file's header record; None if that is damaged.
-        complete: whether the file has its end.
+        complete: whether the file has its end, a summary aside.
         chunks, metadata, attachments: in the order of the file. channels, schemas: those of its summary, by number.
         losses: what is damaged outside of chunks.
     """
@@ -128,6 +129,27 @@ class McapScan:
             return Loss(place.offset, place.length, "a chunk is damaged: its CRC does not match")
         return data
 
+    def contradictions(self, place: ChunkPlace, chunk: bytes) -> list[Loss]:
+        """What the chunk's header and its indexes, which no CRC covers, say otherwise than the intact chunk itself."""
+        index: dict[int, list[int]] = {}
+        position, last = 0, len(chunk) - MESSAGE.size
+        while position <= last:
+            opcode, length, channel, _, log_ns, _ = MESSAGE.unpack_from(chunk, position)
+            if opcode == Opcode.MESSAGE:
+                index.setdefault(channel, []).extend((log_ns, position))
+            position += RECORD.size + length
+        times = [log_ns for entries in index.values() for log_ns in entries[::2]]
+        _, _, *stated, _, _, _ = CHUNK.unpack(self._read(place.offset, CHUNK.size))
+        wrong = ["header"] if times and stated != [min(times), max(times)] else []
+        after = place.offset + place.length
+        held = self._read(after, sum(_INDEX.size + 16 * count for count in place.holds.values()))
+        if held and dict(_indexes_in(held)) != index:
+            wrong.append("index")
+        return [
+            Loss(0, 0, f"the {part} of the chunk at byte {place.offset} is damaged; its samples are intact")
+            for part in wrong
+        ]
+
     # ------------------------------------------------------------------ the way through the file
 
     def _read(self, offset: int, size: int) -> bytes:
@@ -155,6 +177,7 @@ class McapScan:
                 self.losses.append(Loss(offset, following - offset, what))
                 offset = following
             elif head[0] == Opcode.DATA_END:
+                self.complete = True
                 return
             else:
                 offset += length
@@ -228,16 +251,16 @@ class McapScan:
     def _read_summary(self) -> None:
         """Channels and schemas as the end of the file repeats them."""
         tail = self._read(max(0, self.size - _FOOTER_SIZE - len(MAGIC)), _FOOTER_SIZE + len(MAGIC))
-        if tail[:1] != bytes([Opcode.FOOTER]) or tail[_FOOTER_SIZE:] != MAGIC:
+        ends = tail[:1] == bytes([Opcode.FOOTER]) and tail[_FOOTER_SIZE:] == MAGIC
+        footer = _parsed(Opcode.FOOTER, tail[RECORD.size : _FOOTER_SIZE]) if ends else None
+        if not isinstance(footer, Footer) or not 0 < footer.summary_start < self.size:
+            if self.complete:
+                self.losses.append(Loss(0, 0, _NO_SUMMARY))
             return
         self.complete = True
-        footer = _parsed(Opcode.FOOTER, tail[RECORD.size : _FOOTER_SIZE])
-        if not isinstance(footer, Footer) or not 0 < footer.summary_start < self.size:
-            return
         summary = self._read(footer.summary_start, self.size - _FOOTER_SIZE - len(MAGIC) - footer.summary_start)
         if zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary)) != footer.summary_crc:
-            what = "the file's summary is damaged, or something follows it"
-            self.losses.append(Loss(footer.summary_start, len(summary), what))
+            self.losses.append(Loss(footer.summary_start, len(summary), _NO_SUMMARY))
             return
         for opcode, start, end in records_in(summary):
             record = _parsed(opcode, summary[start:end])
@@ -245,6 +268,14 @@ class McapScan:
                 self.schemas[record.id] = record
             elif isinstance(record, Channel):
                 self.channels[record.id] = record
+
+
+def _indexes_in(data: bytes) -> Iterator[tuple[int, list[int]]]:
+    """Channel and entries (log time, place in the chunk) of each message index."""
+    for _, start, end in records_in(data):
+        if end <= len(data):
+            (channel,) = struct.unpack_from("<H", data, start)
+            yield channel, list(struct.unpack_from(f"<{(end - start - 6) // 8}Q", data, start + 6))
 
 
 def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
@@ -16,21 +19,46 @@ class OutputFile(Output, Protocol):
         """No more is written."""
 
 
+@contextmanager
+def whole_file(file: Path) -> Iterator[Path]:
+    """Gives the name of a file beside `file`, which takes its place when it is complete and on the disk.
+
+    Whatever ends the program meanwhile, `file` is whole or as it was; a kill may leave `<name>.<number>.part`.
+    """
+    part = file.with_name(f"{file.name}.{os.getpid()}.part")
+    try:
+        yield part
+        with part.open("rb") as written:
+            os.fsync(written.fileno())
+        part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def create_file(file: Path) -> OutputFile:
     """A new, unbuffered file.
 
     Raises:
         ConfigError: it exists, or cannot be made.
     """
+    refuse_existing(file)
     try:
         return file.open("xb", buffering=0)
-    except FileExistsError as error:
-        raise ConfigError(
-            "the file exists, and a recording is never written over", file=str(file),
-            remedy="choose another name for the recording, or remove the file",
-        ) from error  # fmt: skip
     except OSError as error:
         raise not_writable(file, error) from error
+
+
+def refuse_existing(file: Path, what: str = "a recording") -> None:
+    """See that nothing would be written over.
+
+    Raises:
+        ConfigError: the file exists.
+    """
+    if os.path.lexists(file):
+        raise ConfigError(
+            f"the file exists, and {what} is never written over", file=str(file),
+            remedy="choose another name, or remove the file",
+        )  # fmt: skip
 
 
 def not_writable(file: Path, error: OSError) -> ConfigError:

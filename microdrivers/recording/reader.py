@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from microdrivers.core.errors import ConfigError
-from microdrivers.core.samples import Sample
+from microdrivers.core.samples import Frame, Sample
 from microdrivers.recording.channels import ARRIVALS_TOPIC
 from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording
 from microdrivers.recording.header import (
@@ -74,6 +74,8 @@ class Recording:
         self.clock = read[-1] if read else None
         self._damaged: dict[int, Loss] = {}
         self._unreadable: dict[tuple[int, int], str] = {}
+        self._frames: dict[int, tuple[str, int, int]] = {}
+        """Topic, `t_ns` and `seq` of frames that were read, by the place of a chunk that holds nothing else."""
 
     def samples(
         self, topics: Collection[str] | None = None, *, leave_out: Collection[str] = ()
@@ -89,7 +91,7 @@ class Recording:
     @cached_property
     def _survey(self) -> Survey:
         survey = Survey()
-        for _ in self._walk(None, survey.counter):
+        for _ in self._walk(None, survey.counter, known_frame=survey.count_frame):
             pass
         return survey
 
@@ -134,6 +136,17 @@ class Recording:
         unreadable = [Loss(0, 0, f"{count} × {text}") for text, count in what.items()]
         return [*sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
 
+    def check_indexes(self) -> list[Loss]:
+        """What is damaged of the times and places that other programs find samples by; reads all of the file.
+
+        No sample that is read here depends on it; a repair makes it anew.
+        """
+        chunks = ((place, self._scan.read_chunk(place)) for place in self._scan.chunks)
+        return [
+            loss for place, chunk in chunks if isinstance(chunk, bytes)
+            for loss in self._scan.contradictions(place, chunk)
+        ]  # fmt: skip
+
     @property
     def drops(self) -> list[str]:
         """What the recorder itself has lost, by topic; the first look at it reads all of the file."""
@@ -173,8 +186,12 @@ class Recording:
         action: Callable[[ChannelReader], Action[FoundT]],
         *,
         leave_out: Collection[str] = (),
+        known_frame: Callable[[str, int, int], None] | None = None,
     ) -> Iterator[list[tuple[str, FoundT]]]:
-        """By chunk: topic, and what the channel's action makes of each message of the wanted topics, if anything."""
+        """By chunk: topic, and what the channel's action makes of each message of the wanted topics, if anything.
+
+        Frames that were read before go to `known_frame`, if there is one, and are not read again.
+        """
         actions: dict[int, _Wanted[FoundT] | None] = {}
         schemas: dict[int, Schema] = dict(self._scan.schemas)
         joins: dict[str, FrameJoin] = {}
@@ -200,6 +217,9 @@ class Recording:
         for place in self._scan.chunks:
             if _holds_an_unwanted_image(place, actions):
                 continue
+            if known_frame is not None and place.offset in self._frames:
+                known_frame(*self._frames[place.offset])
+                continue
             chunk = self._scan.read_chunk(place)
             if isinstance(chunk, Loss):
                 self._damaged[place.offset] = chunk
@@ -215,12 +235,14 @@ class Recording:
     ) -> list[tuple[str, FoundT]]:
         """What is made of a chunk's messages; its definitions go to `define`."""
         made: list[tuple[str, FoundT]] = []
+        records = 0
         head, body = MESSAGE_BEGIN.unpack_from, MESSAGE.size
         position, last = 0, len(chunk) - MESSAGE_BEGIN.size
         while position <= last:
             start = position
             opcode, length, number, sequence = head(chunk, start)
             position = end = start + RECORD.size + length
+            records += 1
             if opcode != Opcode.MESSAGE:
                 define(read_definition(opcode, chunk[start + RECORD.size : end]))
                 continue
@@ -239,6 +261,8 @@ class Recording:
                 continue
             if found is not None:
                 made.append((topic, found))
+                if isinstance(found, Frame) and records == 2 and position == len(chunk):  # its info and its image
+                    self._frames[place.offset] = topic, found.t_ns, found.seq
         return made
 
 

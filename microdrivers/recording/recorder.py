@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -105,6 +107,7 @@ class Recorder:
             file.unlink(missing_ok=True)
             raise not_writable(file, error) from error
         self._output = output
+        self._made = _status(file)
         self._last_flush_ns = clock.now_ns()
         self._timer: Timer | None = None
         self._unwatch = bus.watch(self._found_topic)
@@ -117,6 +120,11 @@ class Recorder:
         return dict(self._counts)
 
     @property
+    def dropped(self) -> int:
+        """How many samples of all topics were not written so far."""
+        return sum(count.dropped for count in tuple(self._counts.values()))
+
+    @property
     def size(self) -> int:
         """Bytes in the file so far."""
         return self._out.size
@@ -125,6 +133,14 @@ class Recorder:
     def failure(self) -> OSError | None:
         """Why the file could not be written, the last time that this happened."""
         return self._failure
+
+    @property
+    def disturbance(self) -> str:
+        """What somebody else has done to the file since it was made; empty if neither its name nor its size tells."""
+        now = _status(self.file)
+        if now is None or self._made is None or not os.path.samestat(now, self._made):
+            return "somebody has removed, renamed or replaced it, or its disk"
+        return "" if now.st_size == self.size else "somebody else has written to it, too"
 
     def wants(self, topic: str) -> bool:
         """Whether that topic is recorded, if there is one."""
@@ -176,7 +192,7 @@ class Recorder:
         dropped = {topic: count.dropped for topic, count in self._counts.items() if count.dropped}
         if dropped:
             listed = ", ".join(f"{topic} {number}" for topic, number in dropped.items())
-            _log.error("%s: %d samples were not recorded: %s", self.file, sum(dropped.values()), listed)
+            _log.error("%s: %d samples were not recorded: %s", self.file, self.dropped, listed)
         if self._failure is not None and self._on_failure == "stop":
             raise self._failed(self._failure)
 
@@ -278,6 +294,12 @@ class Recorder:
             f"{self.file} could not be written: {error.strerror or error}",
             remedy="free space on the disk, or choose another file; to go on with gaps, say so: --on-failure go-on",
         )
+
+
+def _status(file: Path) -> os.stat_result | None:
+    with contextlib.suppress(OSError):
+        return file.stat()
+    return None
 
 
 def _bound(take: Callable[[str, Sample], None], topic: str) -> Callable[[Sample], None]:

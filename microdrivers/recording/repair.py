@@ -14,7 +14,7 @@ from microdrivers.recording.header import HEADER_RECORD, PROFILE, REPAIR_RECORD,
 from microdrivers.recording.images import IMAGE_SCHEMA
 from microdrivers.recording.mcap_scan import Loss, McapScan, read_definition, records_in
 from microdrivers.recording.mcap_writer import MESSAGE, ChannelKey, LostChunk, McapWriter
-from microdrivers.recording.output import create_file, not_writable
+from microdrivers.recording.output import not_writable, refuse_existing, whole_file
 from microdrivers.recording.reader import LIST_MARK, open_scan, read_header
 from microdrivers.recording.schemas import FrameInfo, schema_name
 
@@ -26,6 +26,7 @@ class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
         file, out: the original and the repaired one.
         messages: how many messages of which topic were kept.
         losses: what could not be.
+        mended: what was damaged and could be made anew.
         size, lost_bytes: of the original, and how many of these cannot be read.
     """
 
@@ -33,6 +34,7 @@ class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
     out: Path
     messages: Mapping[str, int]
     losses: list[Loss]
+    mended: list[Loss]
     size: int
     lost_bytes: int
 
@@ -47,25 +49,24 @@ def repair(file: Path, out: Path) -> RepairReport:
     scan = open_scan(file)
     try:
         header = read_header(scan)
-        output = create_file(out)
+        refuse_existing(out)
         try:
-            writer = McapWriter(
-                output, profile=PROFILE, library="microdrivers repair",
-                compress_images=any(place.compressed for place in scan.chunks),
-            )  # fmt: skip
-            copy = _Copy(scan, writer)
-            copy.run(to_metadata(header))
+            with whole_file(out) as part, part.open("wb", buffering=0) as output:
+                writer = McapWriter(
+                    output, profile=PROFILE, library="microdrivers repair",
+                    compress_images=any(place.compressed for place in scan.chunks),
+                )  # fmt: skip
+                copy = _Copy(scan, writer)
+                copy.run(to_metadata(header))
+                refuse_existing(out)
         except (OSError, LostChunk) as error:
-            out.unlink()
             raise not_writable(out, error.error if isinstance(error, LostChunk) else error) from error
-        finally:
-            output.close()
     finally:
         scan.close()
     losses = sorted([*scan.losses, *copy.losses])
     return RepairReport(
-        file=file, out=out, messages=dict(copy.messages), losses=losses, size=scan.size,
-        lost_bytes=sum(loss.size for loss in losses),
+        file=file, out=out, messages=dict(copy.messages), losses=losses, mended=copy.mended,
+        size=scan.size, lost_bytes=sum(loss.size for loss in losses),
     )  # fmt: skip
 
 
@@ -75,6 +76,7 @@ class _Copy:
     def __init__(self, scan: McapScan, writer: McapWriter) -> None:
         self.messages: Counter[str] = Counter()
         self.losses: list[Loss] = []
+        self.mended: list[Loss] = []
         self._scan = scan
         self._writer = writer
         self._schemas: dict[int, Schema] = dict(scan.schemas)
@@ -96,6 +98,7 @@ class _Copy:
             if isinstance(chunk, Loss):
                 self.losses.append(chunk)
             else:
+                self.mended += self._scan.contradictions(place, chunk)
                 self._copy_chunk(chunk)
         self._writer.flush()
         if self._undefined:

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from microdrivers.core.samples import Sample
+from microdrivers.core.samples import Frame, Sample
 from microdrivers.core.units import NS_PER_S
 from microdrivers.recording.recorded_channels import Action, ChannelReader, NoteReader
 from microdrivers.recording.schemas import Arrivals, Drops
@@ -55,14 +55,20 @@ class Survey:
 
         def count(data: Any, sequence: int) -> None:
             stamps = reader.stamps(data, sequence)
-            if stamps is None or reader.sample_type is None:
-                return
-            counted = self._counts.get(reader.topic)
-            if counted is None:
-                counted = self._counts[reader.topic] = _Count(reader.sample_type)
-            counted.add(*stamps)
+            if stamps is not None and reader.sample_type is not None:
+                self._count(reader.topic, reader.sample_type, *stamps)
 
         return count
+
+    def count_frame(self, topic: str, t_ns: int, seq: int) -> None:
+        """Count a frame that was read before."""
+        self._count(topic, Frame, t_ns, seq)
+
+    def _count(self, topic: str, sample_type: type[Sample], t_ns: int, seq: int) -> None:
+        counted = self._counts.get(topic)
+        if counted is None:
+            counted = self._counts[topic] = _Count(sample_type)
+        counted.add(t_ns, seq)
 
     def _take_note(self, note: Arrivals | Drops) -> None:
         if isinstance(note, Arrivals):

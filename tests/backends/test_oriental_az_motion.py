@@ -177,3 +177,22 @@ def test_the_last_leg_takes_up_the_play(play: int, start: int, target: int, appr
         return
     assert via is None or -500 <= via <= 4000
     assert sign * last_leg >= min(play, room)
+
+
+@pytest.mark.parametrize("by_callback", [True, False])
+def test_samples_come_in_order_whenever_a_move_is_commanded(by_callback: bool) -> None:
+    bench = Bench(SheetDrive(position=1000)).opened()
+    with bench.motor.stream(70.0):
+        for phase in range(24):
+            bench.clock.run_for(0.5 + phase * 0.0006)
+            target = at_steps(1000 + 200 * (phase % 2))
+            if by_callback:
+                bench.clock.call_at(bench.clock.now_ns(), lambda zoom=target: bench.motor.start_move_to(zoom=zoom))
+            else:
+                bench.motor.start_move_to(zoom=target)
+        bench.clock.run_for(0.5)
+    rests = [sample for sample in bench.samples if sample.t_source == "computed"]
+    assert len(rests) == 24
+    assert [(sample.t_ns, sample.seq) for sample in bench.samples] == sorted(
+        (sample.t_ns, bench.samples[0].seq + number) for number, sample in enumerate(bench.samples)
+    )

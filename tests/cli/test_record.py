@@ -5,11 +5,15 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
+import click
 import h5py
 import pytest
 import yaml
 
+from microdrivers.cli.record import _line
 from microdrivers.configs import shipped_rig
 from microdrivers.core.contact_samples import SpecimenTruth
 from microdrivers.core.samples import ForceSample, Frame
@@ -34,6 +38,24 @@ def test_record_takes_all_that_an_emulated_rig_tells(run, tmp_path):
     assert yaml.safe_load(recording.attachments["rig.yaml"])["name"] == "workstation"
     assert "probe_force" in result.stdout
     assert "0 dropped" in result.stderr
+
+
+@pytest.mark.parametrize("dropped", [0, 12])
+def test_the_live_line_fits_a_terminal(dropped):
+    messages = dict.fromkeys(("truth/optics", "sample_stage", "camera_fine", "camera_lateral", "probe_force"), 1000)
+    recorder = SimpleNamespace(size=123_456_789, dropped=dropped, file=Path("none", "a.mcap"))
+    line = click.unstyle(_line(recorder, messages, {}, 1.0, 12.0, 79))
+    assert len(line) == 79
+    assert line.startswith(f"12 s | 123.5 MB | {dropped} dropped | sample_stage 1000/s · camera_fine 1000/s")
+    assert line.endswith("…")
+    assert click.unstyle(_line(recorder, messages, {}, 1.0, 12.0, 500)).endswith("truth/optics 1000/s")
+
+
+def test_the_live_line_tells_how_long_the_disk_has_room(monkeypatch, tmp_path):
+    recorder = SimpleNamespace(size=10**8, dropped=0, file=tmp_path / "a.mcap")
+    for free, told in ((10**9, ", room for 100 s |"), (10**11, ", room for 2.8 h |"), (10**14, "100.0 MB |")):
+        monkeypatch.setattr("shutil.disk_usage", lambda _folder, free=free: SimpleNamespace(free=free))
+        assert told in _line(recorder, {}, {}, 1.0, 10.0, 79)
 
 
 def test_record_takes_the_topics_that_are_named(run, tmp_path):

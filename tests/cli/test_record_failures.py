@@ -10,6 +10,7 @@ import pytest
 
 from microdrivers.configs import shipped_rig
 from microdrivers.recording.reader import Recording
+from microdrivers.recording.recorder import Recorder
 
 
 @contextlib.contextmanager
@@ -57,12 +58,32 @@ def test_record_on_a_full_disk(run, tmp_path, on_failure):
 def test_a_calibration_goes_on_without_its_disk_and_says_what_its_recording_lacks(run, tmp_path):
     with disk_with(1_500_000):
         result = run("calibrate", "optics", "--frames", 20, "--zoom-to", 0.9, "--out", "run")
-    assert result.exit_code == 0, result.stderr
     dropped = Recording(tmp_path / "run" / "run.mcap").topics["camera_fine"].dropped
     assert dropped > 20
     assert f"MB; it lacks {dropped} samples that could not be written)" in result.stdout
+    told = f"The recording run.mcap lacks {dropped} samples that could not be written (File too large)"
+    assert result.exit_code == 1
+    assert told in " ".join(result.stdout.split())
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["notes"][-1].startswith(told)
+    assert told in (tmp_path / "run" / "report.html").read_text()
     result = run("calibrate", "optics", "--replay", "run/run.mcap")
     assert (result.exit_code, f"not recorded: {dropped} samples" in result.stderr) == (1, True)
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_result_that_the_disk_does_not_take_is_shown_all_the_same(run, tmp_path, as_json):
+    with disk_with(10_000):
+        arguments = ("--no-record", *(["--json"] if as_json else []))
+        result = run("calibrate", "optics", "--frames", 20, "--zoom-to", 0.9, "--out", "run", *arguments)
+    assert result.exit_code == 1
+    for name in ("result.json", "report.html"):
+        assert f"error: run/{name} could not be written: File too large" in result.stderr
+    assert [file.name for file in (tmp_path / "run").iterdir()] == ["calibration.yaml"]
+    if as_json:
+        assert json.loads(result.stdout)["complete"]
+    else:
+        assert "Scale" in result.stdout
+        assert "written to" not in result.stdout
 
 
 def test_a_disk_without_any_space_is_told_before_anything_moves(run, tmp_path):
@@ -118,18 +139,35 @@ def test_exports_to_a_full_disk_fail_and_leave_nothing(run, optics_recording, tm
     assert result.exit_code == 0, result.stderr
 
 
-@pytest.mark.parametrize("replaced", [False, True])
-def test_a_recording_that_somebody_removes_is_told(run, tmp_path, prepared, replaced):
+@pytest.mark.parametrize("how", ["removed", "replaced", "written to"])
+def test_a_recording_that_somebody_else_touches_is_told(run, tmp_path, prepared, how):
     file = tmp_path / "a.mcap"
 
     def remove():
+        if how == "written to":
+            with file.open("ab") as stream:
+                stream.write(bytes(10**6))
+            return
         file.unlink()
-        if replaced:
+        if how == "replaced":
             file.write_text("another")
 
     prepared(lambda rig: rig.clock.call_at(rig.clock.now_ns() + 50_000_000, remove, name="somebody"))
     result = run("record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "zoom")
-    assert (result.exit_code, "gone: while it was written" in result.stdout) == (1, True), result.output
+    assert (result.exit_code, "spoilt: while it was written somebody" in result.stdout) == (1, True), result.output
+    if how == "written to":
+        assert "something follows it" in run("info", "a.mcap").stdout
+
+
+def test_a_calibration_says_that_its_recording_was_spoilt(run, tmp_path, monkeypatch):
+    def close_and_lose(self, close=Recorder.close):
+        close(self)
+        self.file.unlink(missing_ok=True)
+
+    monkeypatch.setattr(Recorder, "close", close_and_lose)
+    result = run("calibrate", "optics", "--frames", 20, "--zoom-to", 0.9, "--out", "run")
+    note = json.loads((tmp_path / "run" / "result.json").read_text())["notes"][-1]
+    assert (result.exit_code, note.startswith("The recording run.mcap is spoilt")) == (1, True)
 
 
 def test_a_contact_sheet_is_whole_or_not_there(run, optics_recording, tmp_path):

@@ -8,6 +8,7 @@ import shutil
 import msgspec
 import pytest
 
+from microdrivers.cli.output import RecordingChoice, start_recording
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.samples import ForceSample
@@ -79,7 +80,11 @@ def test_info(run, run_file, tmp_path):
     assert "rig table, seed 4" in result.stdout
     assert "lost       nothing" in result.stdout
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
-    assert "cannot be written" in run("info", run_file, "--contact-sheet", "sheet.png").stderr
+    again = run("info", run_file, "--contact-sheet", "sheet.png")
+    assert (again.exit_code, "a contact sheet is never written over" in again.stderr) == (1, True)
+    other = run("info", run_file, "--contact-sheet", "sheet.txt")
+    assert (other.exit_code, "must end in .png" in other.stderr) == (1, True)
+    assert not (tmp_path / "sheet.txt").exists()
     found = json.loads(run("info", run_file, "--json").stdout)
     assert found["topics"]["camera"] | {"rate_hz": 0} == {
         "sample_type": "Frame", "count": 30, "rate_hz": 0, "first_s": 0.0, "last_s": pytest.approx(29 / 30, abs=1e-3),
@@ -126,7 +131,7 @@ def test_times_out_of_order_and_dropped_samples_are_told_to_who_uses_them(run, o
     ("kind", "option", "value"),
     [
         *(("optics", "--replay", given) for given in (
-            ("--zoom-to", "1.2"), ("--zoom-from", "0.9"), ("--frames", "100"), ("--settled",), ("--seed", "0"),
+            ("--zoom-to", "1.2"), ("--zoom-from", "0.9"), ("--settled",), ("--seed", "0"),
             ("--record",), ("--compress-images",), ("--radius-um", "100"), ("--rig", "lab.yaml"), ("--fake",),
         )),
         *(("optics", "--images", given) for given in (("--seed", "1"), ("--in-motion",))),
@@ -144,6 +149,39 @@ def test_options_that_drive_an_experiment_are_refused_where_there_is_none(run, t
     assert "leave out --" in result.stderr
     assert value[0].replace("no-", "").replace("--in-motion", "--settled") in result.stderr.splitlines()[-1]
     assert not (tmp_path / "run").exists()
+    others = "--frames, --forgetting" if kind == "optics" else "--leave-out, --protocol"
+    assert f"what can be tried on old data: {others}" in result.stderr
+
+
+def test_other_settings_of_the_estimators_are_tried_on_old_data(run, run_file, force_recording, tmp_path):
+    def again(kind, file, *options):
+        result = run("calibrate", kind, "--replay", file, *options, "--out", f"{kind}{''.join(options)}", "--json")
+        assert result.exit_code == 0, result.stderr
+        return json.loads(result.stdout)
+
+    usual = again("optics", run_file)
+    settings = usual["provenance"]["settings"]
+    fewer = again("optics", run_file, "--frames", "15")
+    assert (usual["frames"], fewer["frames"], fewer["complete"]) == (settings["frames"], 15, True)
+    assert fewer["provenance"]["settings"]["frames"] == 15
+    forgetful = again("optics", run_file, "--forgetting", "0.6", "--flush-frames", "2")
+    assert forgetful["provenance"]["settings"]["forgetting"] == 0.6
+    assert forgetful["scale_sigma_px_per_um"] > 1.2 * usual["scale_sigma_px_per_um"]
+    drifting = again("optics", run_file, "--drift-um-s", "2")
+    assert drifting["projection"] == usual["projection"]
+    assert drifting["angle_sigma_deg"] > 1.2 * usual["angle_sigma_deg"]
+    asked = again("force", force_recording, "--protocol", "loading", "--leave-out", "4")
+    assert asked["best"] == "loading"
+    assert any("loading was asked for; single would be preferred" in note.lower() for note in asked["notes"])
+    assert asked["provenance"]["settings"]["around_reversal"] == 4
+    assert asked["excluded_samples"]["around contact and reversals"] == 5  # 3 as usual
+
+
+def test_old_data_has_no_more_frames_than_it_has(run, run_file):
+    result = run("calibrate", "optics", "--replay", run_file, "--frames", "400")
+    assert (result.exit_code, "frames of the experiment, not 400" in result.stderr) == (1, True)
+    for option, value in (("--forgetting", "nan"), ("--forgetting", "0"), ("--drift-um-s", "inf")):
+        assert run("calibrate", "optics", "--replay", run_file, option, value).exit_code == 2
 
 
 def test_a_replay_never_writes_over_a_result(run, run_file, force_recording, tmp_path):
@@ -338,9 +376,41 @@ def test_analyse_waits_for_no_pipe(run, run_file, tmp_path):
 
 def test_an_interrupted_repair_leaves_no_half_copy(run, run_file, tmp_path, monkeypatch):
     def interrupt(self, place):
-        assert (tmp_path / "new.mcap").exists()
+        assert not (tmp_path / "new.mcap").exists()  # also a kill leaves no half copy of that name
+        assert len(list(tmp_path.glob("new.mcap.*.part"))) == 1
         raise KeyboardInterrupt
 
     monkeypatch.setattr(McapScan, "read_chunk", interrupt)
     result = run("recording", "repair", run_file, "--out", "new.mcap")
-    assert (result.exit_code, (tmp_path / "new.mcap").exists()) == (130, False)
+    assert (result.exit_code, list(tmp_path.glob("new*"))) == (130, [])
+
+
+def test_damage_around_a_chunk_is_told_and_mended(run, run_file):
+    with Recording(run_file) as recording:
+        place = recording._scan.chunks[2]
+    data = bytearray(run_file.read_bytes())
+    data[place.offset + 17] ^= 4  # when its last message was logged
+    run_file.write_bytes(data)
+    told = f"the header of the chunk at byte {place.offset} is damaged; its samples are intact"
+    assert f"  damaged    {told}" in run("info", run_file).stdout
+    repaired = run("recording", "repair", run_file, "--out", "new.mcap").stdout
+    assert f"mended: {told}" in repaired
+    assert "nothing was lost" in repaired
+    assert json.loads(run("info", "new.mcap", "--json").stdout)["damaged_indexes"] == []
+
+
+def test_a_recording_without_samples_is_told(run, tmp_path):
+    Recorder(tmp_path / "a.mcap", bus=Bus(), clock=SimulatedClock(), header=RecordingHeader(source="fake")).close()
+    result = run("replay", "a.mcap")
+    assert (result.exit_code, "holds no samples" in result.stderr) == (1, True)
+
+
+def test_the_calibration_that_a_run_uses_is_in_its_recording(tmp_path):
+    used = tmp_path / "result.json"
+    used.write_text("{}")
+    known = {"fake": True, "seed": 1, "rig_name": "lab", "rig": {"name": "lab"}}
+    choice = RecordingChoice(compress_images=False, calibration=used)
+    start_recording(tmp_path / "run", choice, bus=Bus(), clock=SimulatedClock(), known=known).close()
+    with Recording(tmp_path / "run" / "run.mcap") as recording:
+        assert recording.attachments["calibration.json"] == b"{}"
+        assert list(recording.attachments) == ["rig.yaml", "calibration.json", "provenance.json"]

@@ -57,6 +57,7 @@ def test_no_damage_makes_a_sample_that_was_not_written(recorded, same, tmp_path)
             assert not out.exists()
             return
         found = list(recording.samples())
+        recording.check_indexes()
         check_is_part_of(same, found, recorded.published)
         assert sum(topic.count for topic in recording.topics.values()) == len(found)
         if len(found) < len(recorded.published):
@@ -122,6 +123,36 @@ def test_what_follows_a_damaged_length_is_found_again(recorded, tmp_path):
     assert 0 < lost < 60
     assert [loss.what for loss in recording.losses] == ["something is damaged here"] * 2
     assert recording.topics["force"].gaps + recording.topics["camera"].gaps == lost
+
+
+def test_every_damage_around_a_chunk_is_told(recorded, tmp_path):
+    whole, file = recorded.file.read_bytes(), tmp_path / "damaged.mcap"
+    scan = Recording(recorded.file)._scan
+    place, following = scan.chunks[4:6]
+    assert not Recording(recorded.file).check_indexes()
+    for byte in (*range(place.offset, place.offset + 49), *range(place.offset + place.length, following.offset, 13)):
+        data = bytearray(whole)
+        data[byte] ^= 1 << byte % 8
+        file.write_bytes(data)
+        damaged = Recording(file)
+        assert damaged.losses + damaged.check_indexes(), byte - place.offset
+
+
+def test_damaged_times_of_a_chunk_are_told_and_mended_by_a_repair(recorded, same, tmp_path):
+    data = bytearray(recorded.file.read_bytes())
+    place = Recording(recorded.file)._scan.chunks[4]
+    data[place.offset + 17] ^= 4  # message_end_time
+    data[place.offset + place.length + 20] ^= 4  # a time in its index
+    file = tmp_path / "damaged.mcap"
+    file.write_bytes(data)
+    told = [f"the {part} of the chunk at byte {place.offset} is damaged; its samples are intact" for part in
+            ("header", "index")]  # fmt: skip
+    assert [str(loss) for loss in Recording(file).check_indexes()] == told
+    report = repair(file, tmp_path / "whole.mcap")
+    assert ([str(damage) for damage in report.mended], report.losses) == (told, [])
+    again = Recording(report.out)
+    assert again.losses + again.check_indexes() == []
+    assert len(list(again.samples())) == len(recorded.published)
 
 
 def test_a_channel_whose_definition_is_damaged_is_known_from_the_summary(recorded, tmp_path):

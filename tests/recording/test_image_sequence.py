@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from microdrivers.cli.main import main
@@ -146,6 +147,15 @@ def test_no_motion_is_said(sequence, tmp_path):
 def test_a_folder_without_a_table_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"needs a frames\.csv"):
         ImageSequence(tmp_path)
+
+
+def test_a_sequence_of_an_unknown_rig_is_called_by_its_folder(sequence, tmp_path, monkeypatch):
+    monkeypatch.chdir(sequence)
+    ran = calibrate(Path(), tmp_path / "out")
+    assert ran.exit_code == 0, ran.output
+    assert f"Optical calibration of {sequence.name}, zoom 1\n" in ran.output
+    assert f"<title>Optical calibration of {sequence.name}</title>" in (tmp_path / "out" / "report.html").read_text()
+    assert yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["rig"] is None
 
 
 def test_images_exclude_a_rig(tmp_path):

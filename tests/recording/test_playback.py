@@ -6,6 +6,7 @@ from microdrivers.core.clock import SystemClock
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import ForceSample, Frame
 from microdrivers.recording.playback import open_replay
+from microdrivers.recording.reader import Recording
 
 
 def test_all_is_published_in_order_with_the_recorded_times(recorded, same):
@@ -47,3 +48,19 @@ def test_at_a_speed_times_keep_their_distances(recorded):
         playback.run(10.0)
         assert clock.now_ns() - begin_ns >= 0.0499e9
     clock.close()
+
+
+def test_what_was_read_is_not_read_again_to_survey_it(stage, monkeypatch):
+    with stage.recorder():
+        for seq in range(6):
+            stage.clock.sleep(0.05)
+            stage.force(seq)
+            stage.frame(seq + (seq > 3), shape=(300, 400))
+    with Recording(stage.file) as whole, Recording(stage.file) as recording:
+        assert len(list(recording.samples())) == 12
+        read, read_chunk = [], recording._scan.read_chunk
+        monkeypatch.setattr(recording._scan, "read_chunk", lambda place: read.append(place) or read_chunk(place))
+        assert recording.topics == whole.topics
+        assert recording.topics["camera"].gaps == 1
+        assert recording.flaws == whole.flaws
+        assert sum(place.length for place in read) < 2 * 300 * 400

@@ -6,7 +6,7 @@ import pytest
 from microdrivers.configs import shipped_rig
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock, utc_now
-from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.core.samples import Frame, XYThetaSample
 from microdrivers.recording.header import describe_recording
 from microdrivers.recording.reader import Recording
@@ -55,6 +55,18 @@ def test_a_recorded_calibration_gives_the_same_bits(calibrated):
     assert bits(again.estimates) == bits(run.estimates)
     assert again.arrivals == run.arrivals
     assert again.optics == run.optics
+
+
+def test_the_first_frames_of_a_recorded_calibration_know_nothing_of_what_follows(calibrated):
+    run, file = calibrated
+    provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
+    with Recording(file) as recording:
+        again = calibrate_optics(OpticsReplay(recording, frames=28))
+        with pytest.raises(ConfigError, match="60 frames of the experiment, not 61"):
+            OpticsReplay(recording, frames=61)
+    assert bits(again.estimates) == bits(run.estimates[:28])
+    result = build_optics_result(again, provenance)
+    assert (result.complete, result.frames, result.zoom_change, result.notes) == (True, 28, None, [])
 
 
 def test_an_interrupted_calibration_stays_one_when_it_is_replayed(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import multiprocessing
 import os
 import signal
@@ -36,7 +37,9 @@ class BatchReport(NamedTuple):
 
 
 def find_recordings(runs: Sequence[Path]) -> list[str]:
-    """The recordings that are meant: files as they are, of folders all `*.mcap` in and below; sorted, each once.
+    """The recordings that are meant: files as they are, of folders all `*.mcap` in and below; sorted.
+
+    Each is there once, also if links or several ways of writing its path lead to it: by the first of these.
 
     Raises:
         ConfigError: there is no such file or folder, or a folder holds no recording, or what is named is neither.
@@ -51,7 +54,7 @@ def find_recordings(runs: Sequence[Path]) -> list[str]:
         if not inside:
             raise ConfigError("the folder holds no *.mcap", file=str(run), remedy="name recordings or their folders")
         found.update(inside)
-    return sorted(found)
+    return sorted({os.path.realpath(file): file for file in sorted(found, reverse=True)}.values())
 
 
 def analyse_recordings(
@@ -171,11 +174,21 @@ def _end_with(watched: connection.Connection) -> None:
 # ---------------------------------------------------------------------- cluster
 
 
+async def _knock(address: str) -> None:
+    """Find out whether somebody listens there."""
+    distributed, comm = optional_module("distributed"), optional_module("distributed.comm")
+    arguments = distributed.Security().get_connection_args("client")
+    opened = await comm.connect(address, timeout=SCHEDULER_TIMEOUT, **arguments)
+    opened.abort()
+
+
 def _on_cluster(files: Sequence[str], address: str, analyse: Analyse) -> Iterator[Row]:
     distributed = optional_module("distributed", extra="cluster")
     try:
+        # First: a client that finds no scheduler is not rid of before the program's end, and tells that in a traceback.
+        asyncio.run(_knock(address))
         client = distributed.Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # TypeError: of TLS without certificates
         raise ConfigError(
             f"no Dask scheduler answers at {address!r}: {error}", remedy="check the address, and that it runs"
         ) from error

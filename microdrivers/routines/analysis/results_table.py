@@ -13,6 +13,7 @@ from typing import Any
 
 from microdrivers import __version__
 from microdrivers.core.errors import ConfigError
+from microdrivers.recording.output import whole_file
 from microdrivers.recording.views import optional_module
 from microdrivers.routines.analysis.one import COLUMNS, Row
 
@@ -83,18 +84,18 @@ class ResultsTable:
             ConfigError: it cannot be written; the journal stays.
         """
         rows = [self.rows[name] for name in sorted(set(files))]
-        part = self.file.with_name(f"{self.file.name}.part")
         try:
-            (_write_csv if self.file.suffix == ".csv" else _write_parquet)(part, rows)
-            part.replace(self.file)
+            with whole_file(self.file) as part:
+                (_write_csv if self.file.suffix == ".csv" else _write_parquet)(part, rows)
             self.journal.unlink()
         except OSError as error:
             raise self._not_writable(error) from error
-        finally:
-            part.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Leave the journal to the next run."""
+        """Leave the journal to the next run, if there is anything in it."""
+        if not self.rows:
+            with contextlib.suppress(OSError):
+                self.journal.unlink(missing_ok=True)
         self._stream.close()
 
     def __enter__(self) -> ResultsTable:

@@ -39,7 +39,8 @@ class OpticsRun(NamedTuple):
         arrivals: bus-wide order numbers in the order in which the estimator saw the samples.
         recorded: those samples, if asked for.
         past_run: what a recording tells of its run.
-        last_zoom: the newest reading, which no frame need have been used with; None without any.
+        last_zoom: the newest reading, which no frame need have been used with; of a run that ended as planned, with
+            the last frame that was taken. None without any.
     """
 
     complete: bool
@@ -73,22 +74,25 @@ def calibrate_optics(
     """
     settings = settings or CalibratorSettings()
     bus, names = source.bus, source.names
+    stage, zoom = bus.topic(names.stage, XYThetaSample), bus.topic(names.zoom, ZoomSample)
     track = bus.topic(f"{names.camera}/track", TrackedPoint)
     estimated = bus.topic("estimate/optics", OpticsEstimate)
     estimates: list[OpticsEstimate] = []
     subscription = estimated.subscribe(estimates.append)
     hosts: list[EstimatorHost] = []
     calibrators: list[OpticsCalibrator] = []
+    newest_zoom: ZoomSample | None = None
 
     def publish(result: Sample) -> None:
+        nonlocal newest_zoom
         if isinstance(result, OpticsEstimate):
             estimated.publish(result)
         elif isinstance(result, TrackedPoint):
+            newest_zoom = zoom.latest
             track.publish(result)
 
     def begin(tracker: PointTracker) -> None:
         calibrators.append(OpticsCalibrator(tracker, settings, frames=source.frames_expected()))
-        stage, zoom = bus.topic(names.stage, XYThetaSample), bus.topic(names.zoom, ZoomSample)
         # The first frame was exposed before now: it needs the poses and zoom readings from before.
         history = sorted((*stage.history, *zoom.history), key=lambda sample: sample.order)
         hosts.append(
@@ -118,7 +122,8 @@ def calibrate_optics(
             host.close()
         subscription.cancel()
         note(bus, source.clock, DONE, {"ended_by": ended_by})
-    last_zoom = bus.topic(names.zoom, ZoomSample).latest
+    if ended_by:
+        newest_zoom = zoom.latest
     return OpticsRun(
         complete=not ended_by,
         estimates=estimates,
@@ -129,7 +134,7 @@ def calibrate_optics(
         arrivals=[order for host in hosts for order in host.inbox.arrivals],
         recorded=[sample for host in hosts for sample in host.recorded],
         past_run=source.past_run,
-        last_zoom=None if last_zoom is None else last_zoom.zoom,
+        last_zoom=None if newest_zoom is None else newest_zoom.zoom,
     )
 
 

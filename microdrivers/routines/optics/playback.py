@@ -8,22 +8,30 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.recording.image_sequence import ImageSequence
-from microdrivers.routines.optics.source import Optics, SourceNames
+from microdrivers.routines.optics.source import Optics, SourceNames, frames_taken
 from microdrivers.routines.optics.targets import TargetKind, make_tracker
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 
 class SequencePlayback:
-    """Publishes an image sequence; its target is natural texture unless stated otherwise."""
+    """Publishes an image sequence; its target is natural texture unless stated otherwise.
+
+    Args:
+        frames: how many of its frames the calibration takes, the first ones; None: all.
+
+    Raises:
+        ConfigError: it has fewer.
+    """
 
     past_run = PastRun()
 
-    def __init__(self, sequence: ImageSequence, *, target: TargetKind = "texture") -> None:
+    def __init__(self, sequence: ImageSequence, *, target: TargetKind = "texture", frames: int | None = None) -> None:
         self.bus = Bus()
         self.clock: Clock = SimulatedClock()
         self.names = SourceNames("stage", "zoom", "camera")
         self._sequence = sequence
+        self._frames = frames_taken(frames, len(sequence), source=str(sequence.folder))
         self._target: TargetKind = target
 
     def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
@@ -36,7 +44,7 @@ class SequencePlayback:
         """A sequence tells the image's size and nothing else."""
         height, width = self._sequence.load(self._sequence.rows[0]).shape
         return Optics(
-            camera=self._sequence.folder.name,
+            camera=self._sequence.folder.resolve().name,
             binning=1,
             roi=(0, 0, width, height),
             objective=None,
@@ -44,5 +52,5 @@ class SequencePlayback:
         )
 
     def frames_expected(self) -> int:
-        """Rows of the sequence."""
-        return len(self._sequence)
+        """As asked for, or rows of the sequence."""
+        return self._frames

@@ -11,7 +11,7 @@ from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
-from microdrivers.routines.optics.source import BEGIN, DONE, HOST, Optics, SourceNames
+from microdrivers.routines.optics.source import BEGIN, DONE, HOST, Optics, SourceNames, frames_taken
 from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.past_run import PastRun, past_run
 from microdrivers.routines.progress import Progress
@@ -20,11 +20,14 @@ from microdrivers.routines.progress import Progress
 class OpticsReplay:
     """Publishes what `calibrate optics` has recorded, in the order in which its estimator got it.
 
+    Args:
+        frames: how many of the run's frames the calibration takes, the first ones; None: as the run did.
+
     Raises:
-        UnsupportedError: the recording holds no optical calibration.
+        UnsupportedError: the recording holds no optical calibration. ConfigError: the run took fewer frames.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, *, frames: int | None = None) -> None:
         self.bus = Bus()
         self.clock: Clock = SimulatedClock()
         self._recording = recording
@@ -32,6 +35,8 @@ class OpticsReplay:
         self._beginning = _beginning(recording, notes)
         self._done = [note for note in notes if note.kind == DONE and note.order > self._beginning.order]
         self._missing = 0
+        taken: int | None = self._beginning.content["frames_expected"]
+        self._frames_expected = frames if taken is None else frames_taken(frames, taken, source=str(recording.file))
         self.names = SourceNames(**self._beginning.content["names"])
         self._frames: list[Frame] = []
 
@@ -75,9 +80,8 @@ class OpticsReplay:
         return Optics(**noted | {"roi": tuple(noted["roi"])})
 
     def frames_expected(self) -> int | None:
-        """As it was."""
-        expected: int | None = self._beginning.content["frames_expected"]
-        return expected
+        """As it was, or as asked for."""
+        return self._frames_expected
 
 
 def _beginning(recording: Recording, notes: Sequence[Note]) -> Note:

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
+from microdrivers.core.errors import ConfigError
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
@@ -37,6 +38,17 @@ class Optics(NamedTuple):
     roi: tuple[int, int, int, int]
     objective: float | None
     pixel_pitch_um: float | None
+
+
+def frames_taken(asked: int | None, there: int, *, source: str) -> int:
+    """How many frames of old data a calibration takes.
+
+    Raises:
+        ConfigError: more are asked for than are there.
+    """
+    if asked is not None and asked > there:
+        raise ConfigError(f"{source} holds {there} frames of the experiment, not {asked}", remedy="ask for fewer")
+    return there if asked is None else asked
 
 
 class OpticsSource(Protocol):

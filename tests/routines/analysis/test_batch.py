@@ -170,3 +170,15 @@ def test_a_cluster_needs_its_extra(files, tmp_path, monkeypatch):
     with pytest.raises(UnsupportedError) as caught:
         analyse_recordings(files, tmp_path / "t.csv", dask="tcp://127.0.0.1:1", analyse=fake_row)
     assert "microdrivers[cluster]" in caught.value.remedy
+
+
+def test_a_recording_to_which_links_lead_is_analysed_once(tmp_path, monkeypatch):
+    runs = tmp_path / "runs" / "monday"
+    runs.mkdir(parents=True)
+    (runs / "b.mcap").write_bytes(b"")
+    (runs / "a.mcap").symlink_to("b.mcap")
+    (runs / "back").symlink_to("..")
+    monkeypatch.chdir(tmp_path)
+    named = [Path("runs"), tmp_path / "runs", Path("runs/monday/back/monday/b.mcap"), Path("runs/monday/back")]
+    assert find_recordings(named) == [str(runs / "a.mcap")]
+    assert find_recordings(named[:1]) == ["runs/monday/a.mcap"]

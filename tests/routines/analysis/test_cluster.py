@@ -1,5 +1,6 @@
 """A Dask cluster makes the same table as processes, and one bad file or a broken task does not stop it."""
 
+import distributed
 import pytest
 from distributed import LocalCluster
 
@@ -47,6 +48,15 @@ def test_a_task_that_fails_on_the_cluster_has_a_row(cluster, tmp_path):
         "the cluster has given it up: the worker has lost its memory"
     ]
     assert report.failed == 1
+
+
+@pytest.mark.parametrize("address", ["nowhere", "", "tls://127.0.0.1:9", "smoke://127.0.0.1:9"])
+def test_addresses_that_are_none_leave_no_client_and_no_journal(tmp_path, monkeypatch, address):
+    # A client that finds no scheduler hangs at the program's end, and leaves a traceback.
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("there is a client"))
+    with pytest.raises(ConfigError, match="no Dask scheduler answers"):
+        analyse_recordings(["a"], tmp_path / "t.csv", dask=address, analyse=row_or_failure)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_scheduler_at_the_address(tmp_path, monkeypatch):
