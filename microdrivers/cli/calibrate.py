@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import shlex
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -13,30 +11,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from microdrivers.cli.exit_codes import EXIT_INTERRUPTED
-from microdrivers.cli.output import (
-    RESULT,
-    FiniteRange,
-    RecordingChoice,
-    describe_recorded,
-    describe_rig,
-    exit_status,
-    given,
-    prepare_folder,
-    recorded_as,
-    recording_notes,
-    recording_options,
-    refuse_options_given,
-    start_recording,
-    tell_flaws,
-    write_results,
-)
-from microdrivers.cli.progress import TerminalProgress
+from microdrivers.cli.options import FiniteRange, given, refuse_options_given
+from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
+from microdrivers.cli.run_output import RESULT, RecordingChoice, RunOutput, recording_options
 
 if TYPE_CHECKING:
-    from microdrivers.core.inbox import Inbox
     from microdrivers.estimators.optics.calibrator import CalibratorSettings
-    from microdrivers.recording.recorder import Recorder
     from microdrivers.routines.optics.source import OpticsSource
 
 OF_ANALYSIS = ("frames", "forgetting", "flush_frames", "drift_um_s")
@@ -128,12 +109,13 @@ def optics(
         )
     settings = CalibratorSettings(forgetting=forgetting, flush_frames=flush_frames, sigma_drift_um_s=drift_um_s)
     first = frames if given("frames") else None
-    progress = TerminalProgress(quiet=as_json)
+    of_old_data = images is not None or replay is not None
+    output = RunOutput("optics", out, as_json=as_json, recording=None if of_old_data else recording)
     try:
         if images is not None:
-            status = _from_images(images, first, settings, out, as_json, progress)
+            status = _from_images(images, first, settings, output)
         elif replay is not None:
-            status = _from_recording(replay, first, settings, out, as_json, progress)
+            status = _from_recording(replay, first, settings, output)
         else:
             circle = {
                 "radius_um": radius_um,
@@ -143,58 +125,35 @@ def optics(
                 "settled": settled,
             }
             choice = RigChoice(rig_file or shipped_rig(), fake or rig_file is None, seed, world, wire_log)
-            status = _on_rig(choice, out, circle, settings, real_time, as_json, progress, recording=recording)
+            status = _on_rig(choice, circle, settings, real_time, output)
     finally:
-        progress.close()
+        output.close()
     if status == EXIT_INTERRUPTED:
         click.echo("interrupted: all axes were told to stop", err=True)
     if status:
         sys.exit(status)
 
 
-def _from_images(
-    folder: Path,
-    frames: int | None,
-    settings: CalibratorSettings,
-    out: Path | None,
-    as_json: bool,
-    progress: TerminalProgress,
-) -> int:
+def _from_images(folder: Path, frames: int | None, settings: CalibratorSettings, output: RunOutput) -> int:
     from microdrivers.recording.image_sequence import ImageSequence
     from microdrivers.routines.optics import SequencePlayback
 
     sequence = ImageSequence(folder)
     provenance = {"source": f"image sequence {folder}", "clock": "recorded"}
-    return _run(SequencePlayback(sequence, frames=frames), settings, provenance, out, as_json, progress)
+    return _run(SequencePlayback(sequence, frames=frames), settings, provenance, output)
 
 
-def _from_recording(
-    file: Path,
-    frames: int | None,
-    settings: CalibratorSettings,
-    out: Path | None,
-    as_json: bool,
-    progress: TerminalProgress,
-) -> int:
+def _from_recording(file: Path, frames: int | None, settings: CalibratorSettings, output: RunOutput) -> int:
     from microdrivers.recording.reader import Recording
     from microdrivers.routines.optics import OpticsReplay
 
     with Recording(file) as recording:
         tell_flaws(recording)
-        source = OpticsReplay(recording, frames=frames)
-        return _run(source, settings, describe_recorded(recording), out, as_json, progress)
+        return _run(OpticsReplay(recording, frames=frames), settings, describe_recorded(recording), output)
 
 
 def _on_rig(
-    choice: RigChoice,
-    out: Path | None,
-    circle: dict[str, Any],
-    estimator: CalibratorSettings,
-    real_time: bool,
-    as_json: bool,
-    progress: TerminalProgress,
-    *,
-    recording: RecordingChoice | None,
+    choice: RigChoice, circle: dict[str, Any], estimator: CalibratorSettings, real_time: bool, output: RunOutput
 ) -> int:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
@@ -210,69 +169,37 @@ def _on_rig(
     ):
         settings = CircleSettings(**circle)
         provenance = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict())
-        return _run(CircleExperiment(rig, settings), estimator, provenance, out, as_json, progress, recording=recording)
+        return _run(CircleExperiment(rig, settings), estimator, provenance, output)
 
 
-def _run(
-    source: OpticsSource,
-    settings: CalibratorSettings,
-    known: dict[str, Any],
-    out: Path | None,
-    as_json: bool,
-    progress: TerminalProgress,
-    *,
-    recording: RecordingChoice | None = None,
-) -> int:
-    from microdrivers.core.clock import utc_now
+def _run(source: OpticsSource, settings: CalibratorSettings, known: dict[str, Any], output: RunOutput) -> int:
     from microdrivers.core.errors import CalibrationError
     from microdrivers.report.optics_report import write_optics_report
     from microdrivers.report.summary import optics_summary
     from microdrivers.report.truth import OpticsTruthCollector
     from microdrivers.routines.optics import calibrate_optics
     from microdrivers.routines.optics.calibration import build_result
-    from microdrivers.routines.provenance import describe_run
 
-    out = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-optics"
-    folder = prepare_folder(out)
     truth = OpticsTruthCollector(source.bus)
-    recorder: Recorder | None = None
-
-    def follow(name: str, inbox: Inbox) -> None:
-        if recorder is not None:
-            recorder.follow_arrivals(name, inbox.arrivals)
-
-    with contextlib.ExitStack() as stack:
-        if recording is not None:
-            recorder = stack.enter_context(
-                start_recording(folder, recording, bus=source.bus, clock=source.clock, known=known)
-            )
-        run = calibrate_optics(source, settings=settings, progress=progress, on_host=follow)
+    with output.recorded(source, known):
+        run = calibrate_optics(source, settings=settings, progress=output.progress, on_host=output.follow)
     if not run.estimates and not run.complete:
         click.echo("nothing had been measured yet", err=True)
         return EXIT_INTERRUPTED
     known["settings"] = known.get("settings", {}) | run.settings._asdict() | {"frames": source.frames_expected()}
-    command = shlex.join(["microdrivers", *sys.argv[1:]])
     try:
-        result = build_result(run, describe_run(known, command=command, now=utc_now()))
+        result = build_result(run, output.provenance(known))
     except CalibrationError as error:
         if run.complete:
             raise
         click.echo(f"too little had been measured for a result: {error.what}", err=True)
         return EXIT_INTERRUPTED
-    notes = [*result.notes, *recording_notes(recorder)]
+    notes = [*result.notes, *output.recording_notes]
     result = result.model_copy(update={"truth": truth.compare(result, run.estimates), "notes": notes})
-    progress.step("drawing the report")
+    output.progress.step("drawing the report")
     files: dict[str, Callable[[Path], object]] = {
         RESULT: result.write_json,
         "calibration.yaml": result.write_calibration,
         "report.html": partial(write_optics_report, result),
     }
-    written = write_results(folder, files)
-    progress.close()
-    if as_json:
-        click.echo(result.as_json(), nl=False)
-    else:
-        click.echo(optics_summary(result))
-        if written:
-            click.echo(f"\nwritten to {folder}/: {', '.join(files)}{recorded_as(recorder)}")
-    return exit_status(recorder, complete=run.complete, written=written)
+    return output.finish(result, partial(optics_summary, result), files, complete=run.complete)

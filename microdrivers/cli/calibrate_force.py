@@ -12,29 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.output import (
-    RESULT,
-    RecordingChoice,
-    describe_recorded,
-    describe_rig,
-    exit_status,
-    prepare_folder,
-    recorded_as,
-    recording_notes,
-    recording_options,
-    refuse_options_given,
-    start_recording,
-    tell_flaws,
-    write_results,
-)
-from microdrivers.cli.progress import TerminalProgress
+from microdrivers.cli.options import refuse_options_given
+from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws, write_results
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
+from microdrivers.cli.run_output import RESULT, RecordingChoice, RunOutput, recording_options
 
 if TYPE_CHECKING:
-    from microdrivers.core.inbox import Inbox
     from microdrivers.estimators.force.identify import IdentificationSettings
     from microdrivers.estimators.force.protocols import ProtocolName
-    from microdrivers.recording.recorder import Recorder
     from microdrivers.report.force_truth import ContactTruthCollector
     from microdrivers.results.force import ForceResult
     from microdrivers.routines.force import Characterisation, ForceRun, IndentationSource
@@ -112,27 +97,25 @@ def force(
     from microdrivers.estimators.force.identify import IdentificationSettings
 
     settings = IdentificationSettings(around_reversal=leave_out, protocol=protocol)
-    progress = TerminalProgress(quiet=as_json)
+    of_old_data = table is not None or replay is not None
+    recording = None if of_old_data or recording is None else recording._replace(calibration=calibration)
+    output = RunOutput("force", out, as_json=as_json, recording=recording)
     try:
-        if table is not None or replay is not None:
+        if of_old_data:
             _refuse_rig_options(table, replay)
         if table is not None:
-            status = _from_table(table, specimen, settings, out, as_json, progress)
+            status = _from_table(table, specimen, settings, output)
         elif replay is not None:
-            status = _from_recording(replay, check, settings, out, as_json, progress)
+            status = _from_recording(replay, check, settings, output)
         else:
             _check_figures(press)
             emulated = fake or rig_file is None
             if not emulated and not yes:
                 _ask(rig_file or shipped_rig())
-            overrides = {"specimen": {"preset": specimen}} if emulated and specimen is not None else None
             choice = RigChoice(rig_file or shipped_rig(), emulated, seed, world, wire_log)
-            status = _on_rig(
-                choice, specimen, overrides, calibration, press, check, settings, out, real_time, as_json, progress,
-                recording=recording,
-            )  # fmt: skip
+            status = _on_rig(choice, specimen, calibration, press, check, settings, real_time, output)
     finally:
-        progress.close()
+        output.close()
     if status:
         sys.exit(status)
 
@@ -166,52 +149,32 @@ def _refuse_rig_options(table: Path | None, replay: Path | None) -> None:
     )  # fmt: skip
 
 
-def _from_recording(
-    file: Path,
-    check: bool,
-    settings: IdentificationSettings,
-    out: Path | None,
-    as_json: bool,
-    progress: TerminalProgress,
-) -> int:
+def _from_recording(file: Path, check: bool, settings: IdentificationSettings, output: RunOutput) -> int:
     from microdrivers.recording.reader import Recording
     from microdrivers.routines.force import IndentationReplay
 
     with Recording(file) as recording:
         tell_flaws(recording)
-        known = describe_recorded(recording)
-        return _run(IndentationReplay(recording), known, check, settings, out, as_json, progress)
+        return _run(IndentationReplay(recording), describe_recorded(recording), check, settings, output)
 
 
-def _from_table(
-    file: Path,
-    specimen: str | None,
-    settings: IdentificationSettings,
-    out: Path | None,
-    as_json: bool,
-    progress: TerminalProgress,
-) -> int:
+def _from_table(file: Path, specimen: str | None, settings: IdentificationSettings, output: RunOutput) -> int:
     from microdrivers.recording.indentation_table import IndentationTable
     from microdrivers.routines.force import IndentationPlayback
 
     known = {"source": f"recorded indentation {file}", "clock": "recorded", "settings": {"specimen": specimen}}
-    return _run(IndentationPlayback(IndentationTable(file)), known, False, settings, out, as_json, progress)
+    return _run(IndentationPlayback(IndentationTable(file)), known, False, settings, output)
 
 
 def _on_rig(
     choice: RigChoice,
     specimen: str | None,
-    overrides: dict[str, Any] | None,
     calibration: Path | None,
     press: dict[str, Any],
     check: bool,
     identification: IdentificationSettings,
-    out: Path | None,
     real_time: bool,
-    as_json: bool,
-    progress: TerminalProgress,
-    *,
-    recording: RecordingChoice | None,
+    output: RunOutput,
 ) -> int:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
@@ -219,6 +182,7 @@ def _on_rig(
 
     file, fake, seed, world, wire_log, _ = choice
     clock = SimulatedClock() if fake and not real_time else SystemClock()
+    overrides = {"specimen": {"preset": specimen}} if fake and specimen is not None else None
     with (
         saying_commands(file),
         _naming_the_option(),
@@ -230,9 +194,7 @@ def _on_rig(
         settings = PressSettings(**press)
         sight = Sight.calibrated(rig, calibration) if calibration is not None else Sight()
         known = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict() | {"specimen": specimen})
-        source = PressExperiment(rig, settings, sight=sight)
-        recording = recording and recording._replace(calibration=calibration)
-        return _run(source, known, check, identification, out, as_json, progress, recording=recording)
+        return _run(PressExperiment(rig, settings, sight=sight), known, check, identification, output)
 
 
 @contextlib.contextmanager
@@ -250,65 +212,48 @@ def _naming_the_option() -> Iterator[None]:
 
 
 def _run(
-    source: IndentationSource,
-    known: dict[str, Any],
-    check: bool,
-    settings: IdentificationSettings,
-    out: Path | None,
-    as_json: bool,
-    progress: TerminalProgress,
-    *,
-    recording: RecordingChoice | None = None,
+    source: IndentationSource, known: dict[str, Any], check: bool, settings: IdentificationSettings, output: RunOutput
 ) -> int:
-    from microdrivers.core.clock import utc_now
     from microdrivers.core.errors import MicrodriversError
     from microdrivers.report.force_summary import force_summary
     from microdrivers.report.force_truth import ContactTruthCollector
     from microdrivers.routines.force import Characterisation
 
-    out = out if out is not None else Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-force"
-    folder = prepare_folder(out)
     known["settings"] = known.get("settings", {}) | settings._asdict()
     truth = ContactTruthCollector(source.bus)
-    recorder: Recorder | None = None
-
-    def follow(name: str, inbox: Inbox) -> None:
-        if recorder is not None:
-            recorder.follow_arrivals(name, inbox.arrivals)
-
-    with contextlib.ExitStack() as stack:
-        if recording is not None:
-            recorder = stack.enter_context(
-                start_recording(folder, recording, bus=source.bus, clock=source.clock, known=known)
-            )
-        characterisation = Characterisation(source, on_host=follow, settings=settings)
+    with output.recorded(source, known):
+        characterisation = Characterisation(source, on_host=output.follow, settings=settings)
         try:
-            run = characterisation.run(progress, check=check)
+            run = characterisation.run(output.progress, check=check)
         except MicrodriversError as error:
             found = characterisation.partial(error)
-            measured = _measured(characterisation)
-            if measured and known["clock"] != "recorded" and write_results(folder, measured):
-                click.echo(_what_to_do_with(folder / RECORD, characterisation.tells_nothing), err=True)
+            _tell_what_is_left(characterisation, known, truth, found, output)
             click.echo(source.whereabouts, nl=bool(source.whereabouts), err=True)
-            if found is not None and write_results(folder, _files(_result(found, known, truth, recorder), progress)):
-                progress.close()
-                click.echo(f"what it says of the specimen is in {folder}/: result.json, report.html", err=True)
             if characterisation.interrupted:
                 raise KeyboardInterrupt from error
             raise
-    result = _result(run, known, truth, recorder)
-    files = _measured(characterisation) | _files(result, progress)
-    written = write_results(folder, files)
-    progress.close()
-    if as_json:
-        click.echo(result.as_json(), nl=False)
-    else:
-        click.echo(force_summary(result))
-        if written:
-            click.echo(f"\nwritten to {folder}/: {', '.join(files)}{recorded_as(recorder)}")
+    result = _result(run, known, truth, output)
+    files = _measured(characterisation) | _files(result, output)
+    status = output.finish(result, partial(force_summary, result), files, complete=not characterisation.interrupted)
     if characterisation.interrupted:
         click.echo(f"interrupted; {source.whereabouts or 'the result is from what had been published'}", err=True)
-    return exit_status(recorder, complete=not characterisation.interrupted, written=written)
+    return status
+
+
+def _tell_what_is_left(
+    characterisation: Characterisation,
+    known: dict[str, Any],
+    truth: ContactTruthCollector,
+    found: ForceRun | None,
+    output: RunOutput,
+) -> None:
+    """Keep what an experiment that failed has measured, and what that says of the specimen."""
+    folder, measured = output.folder, _measured(characterisation)
+    if measured and known["clock"] != "recorded" and write_results(folder, measured):
+        click.echo(_what_to_do_with(folder / RECORD, characterisation.tells_nothing), err=True)
+    if found is not None and write_results(folder, _files(_result(found, known, truth, output), output)):
+        output.close()
+        click.echo(f"what it says of the specimen is in {folder}/: result.json, report.html", err=True)
 
 
 def _what_to_do_with(record: Path, tells_nothing: str) -> str:
@@ -319,26 +264,21 @@ def _what_to_do_with(record: Path, tells_nothing: str) -> str:
     return f"what was measured is in {record}; to analyse it: {command}"
 
 
-def _result(
-    run: ForceRun, known: dict[str, Any], truth: ContactTruthCollector, recorder: Recorder | None
-) -> ForceResult:
+def _result(run: ForceRun, known: dict[str, Any], truth: ContactTruthCollector, output: RunOutput) -> ForceResult:
     """What the run says of the specimen; with what its recording lacks, and the truth if it was simulated."""
-    from microdrivers.core.clock import utc_now
     from microdrivers.routines.force import build_result
-    from microdrivers.routines.provenance import describe_run
 
-    command = shlex.join(["microdrivers", *sys.argv[1:]])
-    result = build_result(run, describe_run(known, command=command, now=utc_now()))
-    notes = [*result.notes, *recording_notes(recorder)]
+    result = build_result(run, output.provenance(known))
+    notes = [*result.notes, *output.recording_notes]
     return result.model_copy(update={"truth": truth.compare(result, run.first.deformations), "notes": notes})
 
 
-def _files(result: ForceResult, progress: TerminalProgress) -> dict[str, Callable[[Path], object]]:
+def _files(result: ForceResult, output: RunOutput) -> dict[str, Callable[[Path], object]]:
     """What writes the files of a result."""
     from microdrivers.report.force_report import write_force_report
 
     def draw(file: Path) -> None:
-        progress.step("drawing the report")
+        output.progress.step("drawing the report")
         write_force_report(result, file)
 
     return {RESULT: result.write_json, "specimen.yaml": result.write_specimen, "report.html": draw}

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from microdrivers.cli.output import tell_flaws, topic_patterns
+from microdrivers.cli.options import topic_patterns
+from microdrivers.cli.output import tell_flaws
 from microdrivers.cli.progress import TerminalProgress
 
 if TYPE_CHECKING:

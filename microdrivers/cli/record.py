@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from microdrivers.cli.exit_codes import EXIT_ERROR
-from microdrivers.cli.output import COMPRESSION_HELP, topic_patterns
+from microdrivers.cli.options import COMPRESSION_HELP, topic_patterns
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from microdrivers.cli.calibrate_force import _run
-from microdrivers.cli.progress import TerminalProgress
+from microdrivers.cli.run_output import RunOutput
 from microdrivers.configs import shipped_rig
 from microdrivers.core.errors import MoveCancelled
 from microdrivers.estimators.force.identify import IdentificationSettings
@@ -79,7 +79,7 @@ def test_a_figure_that_cannot_be_is_refused_before_anything_opens(run, tmp_path,
 def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=600, error=MoveCancelled("the force guard has stopped it"))
     with pytest.raises(MoveCancelled):
-        _run(source, dict(KNOWN), True, IdentificationSettings(), tmp_path, False, TerminalProgress(quiet=True))
+        _run(source, dict(KNOWN), True, IdentificationSettings(), RunOutput("force", tmp_path, as_json=True))
     result = read_force_result(tmp_path / "result.json")
     assert not result.complete
     assert result.notes[-1] == (
@@ -96,7 +96,7 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=60, error=KeyboardInterrupt())
     source.whereabouts = "probe_stage stands at x 10.0 µm; no contact was felt"
     with pytest.raises(KeyboardInterrupt):
-        _run(source, dict(KNOWN), True, IdentificationSettings(), tmp_path, False, TerminalProgress(quiet=True))
+        _run(source, dict(KNOWN), True, IdentificationSettings(), RunOutput("force", tmp_path, as_json=True))
     assert source.finished == 1
     assert len(measured(tmp_path)) == 60
     told = capsys.readouterr().err

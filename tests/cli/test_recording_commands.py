@@ -8,7 +8,7 @@ import shutil
 import msgspec
 import pytest
 
-from microdrivers.cli.output import RecordingChoice, start_recording
+from microdrivers.cli.run_output import RecordingChoice, start_recording
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.samples import ForceSample
