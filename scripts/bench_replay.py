@@ -2,7 +2,11 @@
 
     python scripts/bench_replay.py [--recordings 200] [--folder DIR]
 
-Replay is judged by processor time, so that other programs on the machine count less; the wall time stands beside it.
+Replay is judged by the processor time of the best of several rounds, so that other programs on the machine count less;
+the median and the wall time stand beside it. A round is what `calibrate optics --replay FILE` does with the file, from
+opening it to the last estimate, the notes on its flaws included; without tracking, what `replay FILE` publishes.
+Python's start, all imports and the report take the same time for recordings of any length: they are in the line "the
+whole command" alone. The recorded time, from the first sample to the last one, is that of the emulated rig.
 The batch needs two free cores: the load of the machine is shown with it. Its recordings are hard links to a few short
 calibrations of different worlds.
 """
@@ -63,16 +67,26 @@ def record(file: Path, *, seed: int, frames: int) -> float:
 
 
 def span_s(file: Path) -> float:
-    """From the first to the last frame: between routines' waits, what a camera has seen in real time."""
+    """From the first to the last sample, recorded time."""
     with Recording(file) as recording:
         ends = [(topic.first_t_ns, topic.last_t_ns) for topic in recording.topics.values() if topic.count]
     return (max(last for _, last in ends) - min(first for first, _ in ends)) / 1e9
 
 
-def track(file: Path) -> None:
-    """Replay with tracker and estimator."""
+def track(file: Path) -> int:
+    """Replay with tracker and estimator; number of frames."""
     with Recording(file) as recording:
-        calibrate_optics(OpticsReplay(recording))
+        return len(calibrate_optics(OpticsReplay(recording)).estimates)
+
+
+def track_by_command(file: Path) -> Took:
+    """The whole command with its start and its report."""
+    command = ["calibrate", "optics", "--replay", str(file), "--out", str(file.with_suffix(""))]
+    before, begin = os.times(), time.perf_counter()
+    subprocess.run([sys.executable, "-m", "microdrivers", *command], check=True, capture_output=True)
+    after = os.times()
+    cpu_s = after.children_user + after.children_system - before.children_user - before.children_system
+    return Took(cpu_s, time.perf_counter() - begin)
 
 
 def publish(file: Path, leave_out: tuple[str, ...] = ()) -> None:
@@ -119,18 +133,26 @@ def main() -> int:
     arguments = parser.parse_args()
     rows: list[Figure] = []
 
-    def add_speed(what: str, must: float, recorded_s: float, call: Callable[[], object], *, times: int) -> None:
+    def add_speed(what: str, must: float, recorded_s: float, call: Callable[[], object], *, times: int) -> Took:
         call()
-        took = min(timed(call) for _ in range(times))
-        factor = recorded_s / took.cpu_s
-        told = f"{factor:.0f} × ({recorded_s / took.wall_s:.0f} × by the wall clock)"
-        rows.append(Figure(what, f"≥ {must:g} ×", told, factor >= must))
+        rounds = sorted(timed(call) for _ in range(times))
+        best, median = rounds[0], rounds[times // 2]
+        factor = recorded_s / best.cpu_s
+        others = f"median {recorded_s / median.cpu_s:.0f} ×, {recorded_s / best.wall_s:.0f} × by the wall clock"
+        rows.append(Figure(what, f"≥ {must:g} ×", f"{factor:.0f} × ({others})", factor >= must))
+        return best
 
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
         folder = Path(name)
         file = folder / "optics.mcap"
         recorded_s = record(file, seed=1, frames=FRAMES)
-        add_speed(f"replay with tracking, {FRAMES} frames", 20, recorded_s, lambda: track(file), times=10)
+        frames = track(file)
+        best = add_speed(f"replay with tracking, {frames} frames", 20, recorded_s, lambda: track(file), times=10)
+        each = f"{1e3 * best.cpu_s / frames:.2f} ms a frame, of {1e3 * recorded_s / frames:.1f} ms recorded"
+        rows.append(Figure("  processor time", "", f"{best.cpu_s:.3f} s of {recorded_s:.2f} s: {each}"))
+        whole = track_by_command(file)
+        told = f"{whole.cpu_s:.1f} s ({whole.wall_s:.1f} s by the wall clock)"
+        rows.append(Figure("  the whole command, start and report included", "", told))
         dense = folder / "minute.mcap"
         minute(dense, arguments.seconds)
         recorded_s = span_s(dense)
@@ -162,7 +184,7 @@ def main() -> int:
         )
         rows.append(Figure("  it was killed in the middle", "yes", "yes" if middle else "no", middle))
     show(rows)
-    return 0 if all(row.reached for row in rows) else 1
+    return 0 if all(row.reached is not False for row in rows) else 1
 
 
 if __name__ == "__main__":

@@ -5,35 +5,21 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from microdrivers.estimators.vision.edge_crossings import cross, edges_of, pixels_across
 from microdrivers.estimators.vision.points import GreyImage
-from microdrivers.estimators.vision.quadrilateral import FOLLOWING, FloatArray, intersect_lines
+from microdrivers.estimators.vision.quadrilateral import FloatArray, intersect_lines
 
-_ALONG = np.linspace(-0.7, 0.7, 11)
-_SQUARE_OF_ALONG = float(np.mean(_ALONG**2))
-
-
-class EdgeFrames(NamedTuple):
-    """A straight line per edge: middle, unit tangent, inward unit normal (4×2 each), half-length (4)."""
-
-    middle: FloatArray
-    tangent: FloatArray
-    normal: FloatArray
-    half_length: FloatArray
-
-    def lines(self, offsets: FloatArray, slopes: FloatArray) -> FloatArray:
-        """Rows (n_u, n_v, c) of n·p = c for the edges moved inward by `offsets` + `slopes` · along, px."""
-        lines = np.empty((4, 3))
-        lines[:, :2] = self.normal - (slopes / self.half_length)[:, None] * self.tangent
-        lines[:, 2] = offsets + (lines[:, :2] * self.middle).sum(axis=1)
-        return lines
+_PROFILES = 16
+"""So many profiles, or fewer, on either side of the middle of an edge."""
+_PROFILES_WITHIN = 0.8
+"""They keep to this share of their edge: beyond, they would meet the next one."""
 
 
 class Start(NamedTuple):
-    """Where a fit begins: corners to a tenth of a pixel, grey levels and blur to some percent."""
+    """Where a fit begins: corners to some hundredths of a pixel, grey levels and blur to some percent."""
 
     quad: FloatArray
     outside: float
@@ -42,38 +28,26 @@ class Start(NamedTuple):
 
 
 class Bands(NamedTuple):
-    """Pixels near the four edges, ordered by edge, in the frame of their own edge.
+    """Pixels near the four edges in the frame of their own edge: 4 edges × pixels of a line across × lines.
 
-    The rows of `pixels` (float32: half the time, and rounding stays below 1e-6 px) are the grey level; `across`,
-    the distance from the starting line (px, inward positive); `along`, −1 … 1 between the corners; u and v from
-    the centre, in sides. `cells` are their places in the box `box_shape` around the square, `parts` each edge's
-    range of pixels, `counts` the lengths of these.
+    The rows of `pixels` (float32: half the time, and rounding stays below 1e-6 px) are the grey level; 1; u and v
+    from the centre, in sides; `across`, the distance from the starting line (px, inward positive); `along`, −1 … 1
+    between the corners. The first four are 0 for pixels that are left out, among them all of the first and the last
+    line of each edge. `counts` tells how many pixels of each edge are not.
     """
 
     pixels: npt.NDArray[np.float32]
-    cells: npt.NDArray[np.intp]
-    box_shape: tuple[int, int]
-    parts: tuple[slice, ...]
-    counts: tuple[int, ...]
+    counts: list[int]
 
-    def keep(self, wanted: npt.NDArray[np.bool_]) -> Bands:
-        """Only the `wanted` pixels."""
-        counts = tuple(int(np.count_nonzero(wanted[part])) for part in self.parts)
-        return Bands(self.pixels[:, wanted], self.cells[wanted], self.box_shape, _parts(counts), counts)
+    def without(self, unwanted: npt.NDArray[np.bool_]) -> Bands:
+        """The bands with the `unwanted` pixels left out."""
+        pixels = self.pixels.copy()
+        pixels[:4] *= ~unwanted
+        return Bands(pixels, _counts(pixels))
 
 
-def _parts(counts: tuple[int, ...]) -> tuple[slice, ...]:
-    a, b, c, d = counts
-    return slice(0, a), slice(a, a + b), slice(a + b, a + b + c), slice(a + b + c, a + b + c + d)
-
-
-def edge_frames(quad: FloatArray) -> EdgeFrames:
-    """The straight lines between adjacent corners; `quad` is clockwise as displayed."""
-    step = quad[FOLLOWING] - quad
-    half_length = 0.5 * np.hypot(step[:, 0], step[:, 1])
-    tangent = step / (2.0 * half_length[:, None])
-    normal = tangent[:, ::-1] * (-1.0, 1.0)
-    return EdgeFrames(quad + 0.5 * step, tangent, normal, half_length)
+def _counts(pixels: npt.NDArray[np.float32]) -> list[int]:
+    return [int(np.count_nonzero(ones)) for ones in pixels[1]]
 
 
 def estimate_start(image: GreyImage, quad: FloatArray, *, reach_px: float) -> Start | None:
@@ -82,80 +56,73 @@ def estimate_start(image: GreyImage, quad: FloatArray, *, reach_px: float) -> St
     With y the profile normalised to 0 … 1, the mean of y tells where the edge lies, and the mean of y(1 − y) its
     blur. None if there is no contrast.
     """
-    frames = edge_frames(quad)
-    across = np.arange(-math.floor(reach_px), math.floor(reach_px) + 1.0)
-    rows, columns = image.shape
-    u, v = (
-        (frames.middle[:, k, None] + (frames.half_length * frames.tangent[:, k])[:, None] * _ALONG)[:, :, None]
-        + frames.normal[:, k, None, None] * across
-        for k in (0, 1)
-    )
-    column = np.rint(u).astype(np.intp).clip(0, columns - 1)
-    row = np.rint(v).astype(np.intp).clip(0, rows - 1)
-    profile = image[row, column].astype(np.float64)
-    tail = max(2, len(across) // 5)
-    outside = _median(profile[:, :, :tail])
-    contrast = _median(profile[:, :, -tail:]) - outside
-    if contrast == 0.0:
+    edges = edges_of(quad)
+    reach = pixels_across(edges, reach_px)
+    span = min(edge.span(_PROFILES_WITHIN * edge.half_length, -reach) for edge in edges)
+    stride = math.ceil(span / _PROFILES)
+    crossings = cross(edges, image.shape, lines=max(1, int(span // stride)), stride=stride, reach=reach)
+    profiles = image.take(crossings.cells).astype(np.float64)
+    length = profiles.shape[1]
+    tail = max(2, length // 5)
+    outside = _levels(profiles[:, :tail])
+    contrast = _levels(profiles[:, -tail:]) - outside
+    if not contrast.all():
         return None
-    profile -= outside
-    profile *= 1.0 / contrast
-    length = float(len(across))
-    area = length * float((profile * (1.0 - profile)).mean())
-    position = length * (0.5 - profile.mean(axis=2))
-    lines = frames.lines(position.mean(axis=1), (position @ _ALONG) / (len(_ALONG) * _SQUARE_OF_ALONG))
-    moved = intersect_lines(lines)
+    profiles -= outside[:, None, None]
+    inside = profiles.sum(axis=1) / contrast[:, None]
+    to_edge = 0.5 * length - inside
+    points = np.ones((4, 3, to_edge.shape[1]))
+    points[:, 1:] = crossings.middles[:, 2:] + crossings.steps[:, 2:, None] * to_edge[:, None]
+    products = (points @ points.transpose(0, 2, 1)).tolist()
+    moved = intersect_lines([edge.line(*_straight(own)) for edge, own in zip(edges, products, strict=True)])
     if not np.abs(moved - quad).max() < 0.5 * reach_px:
         moved = quad
-    return Start(moved, outside, contrast, min(max(math.sqrt(math.pi) * area, 0.5), 0.4 * reach_px))
+    squares = np.einsum("eij,eij->e", profiles, profiles) / contrast**2
+    area = float((inside.sum(axis=1) - squares) @ crossings.steps[:, 2]) / to_edge.size
+    blur_px = min(max(math.sqrt(math.pi) * area, 0.5), 0.4 * reach_px)
+    return Start(moved, sum(outside.tolist()) / 4.0, sum(contrast.tolist()) / 4.0, blur_px)
 
 
-def _median(values: npt.NDArray[np.float64]) -> float:
-    middle = values.size // 2
-    return float(np.partition(values, middle, axis=None)[middle])
+def _levels(pixels: FloatArray) -> FloatArray:
+    """Mean grey level of each edge's pixels, the brightest and the darkest quarter left out."""
+    in_order = np.sort(pixels.reshape(4, -1), axis=1)
+    quarter = in_order.shape[1] // 4
+    middle = in_order[:, quarter:-quarter]
+    return np.asarray(middle.sum(axis=1) / middle.shape[1])
+
+
+def _straight(products: list[list[float]]) -> tuple[float, float]:
+    """Offset and slope of the line through points, from the sums of products of 1, across and along."""
+    (count, across, along), (_, _, across_along), (_, _, along_along) = products
+    slope = (count * across_along - along * across) / (count * along_along - along * along)
+    return (across - slope * along) / count, slope
 
 
 def select_bands(image: GreyImage, quad: FloatArray, *, half_width: float, corner_gap: float) -> Bands:
     """Collect the pixels within `half_width` of an edge and farther than `corner_gap` from its corners, px."""
-    frames = edge_frames(quad)
-    rows, columns = image.shape
-    low = np.maximum(np.floor(quad.min(axis=0) - half_width - 2.0), 0).astype(int)
-    high = np.minimum(np.ceil(quad.max(axis=0) + half_width + 3.0), (columns, rows)).astype(int)
-    box = image[low[1] : high[1], low[0] : high[0]]
-    box_shape = int(box.shape[0]), int(box.shape[1])
-
-    edge_of = np.zeros(box_shape, dtype=np.uint8)
-    outlines = _outlines(frames, half_width, corner_gap) - low
-    for k, outline in enumerate(np.rint(outlines * 16).astype(np.int32)):
-        cv2.fillConvexPoly(edge_of, outline, k + 1, lineType=cv2.LINE_8, shift=4)
-    of_each = [np.flatnonzero(edge_of == k) for k in range(1, 5)]
-    cells = np.concatenate(of_each)
-    counts = tuple(len(own) for own in of_each)
-    bands = Bands(np.empty((5, len(cells)), np.float32), cells, box_shape, _parts(counts), counts)
-
-    grey, across, along, u, v = bands.pixels
-    grey[:] = box.ravel()[cells]
-    row = cells // box_shape[1]
-    v[:] = row
-    u[:] = cells - row * box_shape[1]
-    centre = quad.mean(axis=0)
-    u += low[0] - centre[0]
-    v += low[1] - centre[1]
-    middle = frames.middle - centre
-    tangent = frames.tangent / frames.half_length[:, None]
-    rest = (frames.normal * middle).sum(axis=1), (tangent * middle).sum(axis=1)
-    for k, part in enumerate(bands.parts):
-        across[part] = frames.normal[k, 0] * u[part] + frames.normal[k, 1] * v[part] - rest[0][k]
-        along[part] = tangent[k, 0] * u[part] + tangent[k, 1] * v[part] - rest[1][k]
-    bands.pixels[3:] *= 2.0 / frames.half_length.sum()
-    return bands
-
-
-def _outlines(frames: EdgeFrames, half_width: float, corner_gap: float) -> FloatArray:
-    """The rectangle around each edge, 4 edges × 4 corners × 2."""
-    reach = (frames.half_length - corner_gap)[:, None] * frames.tangent
-    width = half_width * frames.normal
-    middle = frames.middle
-    return np.stack(
-        [middle - reach - width, middle + reach - width, middle + reach + width, middle - reach + width], axis=1
+    edges = edges_of(quad)
+    reach = pixels_across(edges, half_width)
+    span = max(edge.span(edge.half_length - corner_gap, reach) for edge in edges)
+    crossings = cross(edges, image.shape, lines=math.ceil(span + 0.5), stride=1, reach=reach)
+    pixels = np.empty((6, *crossings.cells.shape), dtype=np.float32)
+    pixels[0] = image.take(crossings.cells)
+    middles, steps = crossings.middles, crossings.steps
+    per_side = 2.0 / sum(edge.half_length for edge in edges)
+    middles[:, 0] -= sum(edge.u for edge in edges) / 4.0
+    middles[:, 1] -= sum(edge.v for edge in edges) / 4.0
+    middles[:, :2] *= per_side
+    steps[:, :2] *= per_side
+    growth = steps[:, :, None] * crossings.places
+    np.add(
+        middles.astype(np.float32).transpose(1, 0, 2)[:, :, None, :],
+        growth.astype(np.float32).transpose(1, 0, 2)[:, :, :, None],
+        out=pixels[2:],
     )
+    ends = np.array([1.0 - corner_gap / edge.half_length for edge in edges], dtype=np.float32)
+    wanted = np.abs(pixels[5]) <= ends[:, None, None]
+    if crossings.in_view is not None:
+        wanted &= crossings.in_view
+    pixels[1] = wanted
+    pixels[0] *= pixels[1]
+    pixels[2:4] *= pixels[1]
+    return Bands(pixels, _counts(pixels))

@@ -17,9 +17,10 @@ from microdrivers.estimators.vision.quadrilateral import (
     ORDER,
     FloatArray,
     find_quadrilaterals,
+    glance,
     is_inside,
     is_square_like,
-    side_lengths,
+    mean_side,
 )
 
 MissReason = Literal[
@@ -67,8 +68,8 @@ class SquareFit(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     @property
     def centre_px(self) -> tuple[float, float]:
         """Mean of the corners, (u, v) from the centre of the top-left pixel."""
-        u, v = self.corners_px.mean(axis=0)
-        return float(u), float(v)
+        u, v = self.corners_px.sum(axis=0).tolist()
+        return u / 4.0, v / 4.0
 
     def starting_at(self, row: int) -> SquareFit:
         """The same square with the corner of `row` first; the cyclic order stays."""
@@ -118,23 +119,35 @@ def locate_square(
             remedy="edges shorter than that cannot be fitted; zoom in or choose a larger target",
         )
     full_scale = float(2 ** (bit_depth or 8 * grey.dtype.itemsize) - 1)
+    seen = glance(grey, min_side_px=min_side_px)
+    if seen is not None:
+        outcome = _first_fit(grey, [seen], 0, full_scale, min_side_px)
+        if isinstance(outcome, SquareFit):
+            return outcome
     detection = find_quadrilaterals(grey, min_side_px=min_side_px)
     if not detection.quads:
         return _nothing_detected(grey, full_scale, partly_in_view=detection.partly_in_view)
     quads, rivals = _in_order_of_choice(detection.quads, near_px)
-    first_miss: SquareNotFound | None = None
-    for quad in quads[:_MAX_FITS]:
-        fit = fit_edges(grey, quad, full_scale=full_scale)
-        miss = _fault(grey, quad, fit, min_side_px)
+    return _first_fit(grey, quads[:_MAX_FITS], rivals, full_scale, min_side_px)
+
+
+def _first_fit(
+    image: GreyImage, quads: list[FloatArray], rivals: int, full_scale: float, min_side_px: float
+) -> SquareFit | SquareNotFound:
+    """The first of `quads` that is a square, or what is wrong with the first of all."""
+    misses = []
+    for quad in quads:
+        fit = fit_edges(image, quad, full_scale=full_scale)
+        miss = _fault(image, quad, fit, min_side_px)
         if fit is not None and miss is None:
             return _as_square(fit, rivals)
-        first_miss = first_miss or miss
-    return first_miss or SquareNotFound("no_square", "no square in view")
+        misses.append(miss)
+    return next(filter(None, misses), SquareNotFound("no_square", "no square in view"))
 
 
 def _in_order_of_choice(quads: list[FloatArray], near_px: tuple[float, float] | None) -> tuple[list[FloatArray], int]:
     """Candidates in the order in which to try them, and the number of rivals of the largest."""
-    areas = [float(side_lengths(quad).mean()) ** 2 for quad in quads]
+    areas = [mean_side(quad) ** 2 for quad in quads]
     rivals = [quad for quad, area in zip(quads, areas, strict=True) if area >= 0.5 * areas[0]]
     others = [quad for quad, area in zip(quads, areas, strict=True) if area < 0.5 * areas[0]]
     if near_px is not None:
@@ -157,7 +170,7 @@ def _fault(image: GreyImage, quad: FloatArray, fit: EdgeFit | None, min_side_px:
     """What disqualifies a fit, or None."""
     if fit is None:
         return SquareNotFound("poor_fit", "the edge fit has no solution")
-    side = float(side_lengths(fit.corners).mean())
+    side = mean_side(fit.corners)
     if fit.saturated > _MAX_SATURATED:
         share = f"{100 * fit.saturated:.0f} %"
         return SquareNotFound("saturated", f"{share} of the edge pixels are at an end of the grey scale")
@@ -192,11 +205,11 @@ def _noise_level(image: GreyImage, quad: FloatArray) -> float:
 
 
 def _as_square(fit: EdgeFit, rivals: int) -> SquareFit:
-    sigma = np.sqrt(0.5 * np.trace(fit.covariances, axis1=1, axis2=2))
+    sigma = np.sqrt(0.5 * (fit.covariances[:, 0, 0] + fit.covariances[:, 1, 1]))
     square = SquareFit(
         corners_px=fit.corners,
         sigma_px=sigma,
-        side_px=float(side_lengths(fit.corners).mean()),
+        side_px=mean_side(fit.corners),
         blur_px=fit.blur_px,
         contrast=fit.contrast,
         residual_sigma=fit.residual_sigma,

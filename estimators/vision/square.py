@@ -6,6 +6,7 @@ import cmath
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.samples import Frame, TrackedPoint
@@ -29,11 +30,16 @@ def least_turn(previous: FloatArray, current: FloatArray) -> tuple[int, float]:
         positive clockwise as displayed (u right, v down). The turn never exceeds 45° by much: a square does not
         tell more.
     """
-    before = (previous - previous.mean(axis=0)) @ (1.0, 1.0j)
-    after = (current - current.mean(axis=0)) @ (1.0, 1.0j)
-    turns = [cmath.phase(complex(np.vdot(before, after[ORDER[row]]))) for row in range(4)]
+    before, after = (_from_centre(corners) for corners in (previous, current))
+    turns = [cmath.phase(product) for product in (after[ORDER] @ before.conj()).tolist()]
     row = min(range(4), key=lambda k: abs(turns[k]))
     return row, math.degrees(turns[row])
+
+
+def _from_centre(corners: FloatArray) -> npt.NDArray[np.complex128]:
+    """The corners as complex numbers u + i·v from their mean."""
+    places = corners @ (1.0, 1.0j)
+    return np.asarray(places - places.sum() / 4.0)
 
 
 class SquareTracker:

@@ -42,7 +42,10 @@ class Codec(Generic[MessageT]):
             "<" + "".join(("B" if field.number < 16 else "H") + _FORMATS[field.kind] for field in fixed)
         )
         self._template: list[Any] = [part for tag in tags for part in (tag, 0)]
-        self._rest = {_tag(field): (index, field.kind) for index, field in enumerate([*self._varying, *self._texts])}
+        self._rest = {
+            field.number << 3 | _DELIMITED: (index, field.kind)
+            for index, field in enumerate([*self._varying, *self._texts])
+        }
         self._empty_rest = [_EMPTY[field.kind] for field in [*self._varying, *self._texts]]
         self._fixed_of = _getter([field.name for field in fixed])
         self._texts_of = _getter([field.name for field in self._texts])
@@ -90,7 +93,7 @@ class Codec(Generic[MessageT]):
                 size, position = _read_varint(data, position)
                 payload = data[position : position + size]
                 position += size
-                index, kind = self._rest[_as_written(tag)]
+                index, kind = self._rest[tag]
                 values[index] = _decode(kind, payload, values[index])
         except (IndexError, KeyError, UnicodeDecodeError, struct.error) as error:
             raise UnusualLayout from error
