@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from microdrivers.core.errors import NoContact
+from microdrivers.estimators.force.departure import Departure, find_departure
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.record import CLEAR
 
 BRANCH_NAMES = ("approach", "loading", "hold", "unloading", "lost")
 
 _BASELINE = 30
-"""Samples before a force that tell whether it has left the baseline."""
+"""Samples before a contact that tell its baseline."""
 
 _FEWEST_AT_REST = 8
 _TURN_SHARE = 0.5
@@ -30,6 +31,9 @@ _SHORTEST_LOSS = 3
 _STARTS_IN_CONTACT = 0.05
 """Growth of the force before the contact, relative to that while loading, which is more than a sensor's drift."""
 
+_CLEAR_SLOPE = 4.0
+"""Standard deviations of a slope that are no noise."""
+
 
 class Branches(NamedTuple):
     """Index ranges of one indentation, in order and without holes; empty where there is none.
@@ -37,9 +41,9 @@ class Branches(NamedTuple):
     Attributes:
         approach: out of contact, before. loading: the deformation grows. hold: it stays. unloading: it shrinks.
         lost: out of contact again.
-        onset_s: the last instant without and the first with a force; None if the record begins in contact.
+        onset_s: the last instant without a force for sure and the first with one; None if the record begins in contact.
         turns_s: instants of the reversals: one without a hold, two with it, none if the record ends before.
-        release_s: instant at which contact was lost; None if the record ends before.
+        release_s: the last instant with a force for sure and the first without; None if the record ends before.
     """
 
     approach: range
@@ -49,7 +53,12 @@ class Branches(NamedTuple):
     lost: range
     onset_s: tuple[float, float] | None
     turns_s: tuple[float, ...]
-    release_s: float | None
+    release_s: tuple[float, float] | None
+
+    @property
+    def released_s(self) -> float | None:
+        """When contact was lost, as far as that is known; None if the record ends before."""
+        return None if self.release_s is None else sum(self.release_s) / 2.0
 
     def labels(self) -> list[str]:
         """Name of the branch of every sample."""
@@ -76,7 +85,8 @@ def find_branches(
     """
     n = len(time_s)
     peak = int(np.argmax(_smooth(deformation_um)))
-    first = _onset(time_s, force_uN, force_sigma_uN)
+    onset = _onset(time_s, force_uN, force_sigma_uN)
+    first = onset.early
     peak = max(peak, first + 1)
     if peak >= n or force_uN[first : peak + 3].max() - force_uN[max(first - 1, 0)] < CLEAR * force_sigma_uN:
         raise NoContact(
@@ -88,19 +98,21 @@ def find_branches(
     hold_end = int(np.searchsorted(time_s, turns[-1])) if turns else n
     if len(turns) == 1 and _holds(time_s, deformation_um, first, load_end):
         hold_end = n
-    gone = _loss(force_uN, first, hold_end, force_sigma_uN)
-    slipped_off = _loss(force_uN, first, first, force_sigma_uN) if gone == hold_end < n else n
-    if slipped_off < hold_end:
-        gone, hold_end, load_end = (min(end, slipped_off) for end in (gone, hold_end, load_end))
+    going, gone = _loss(force_uN, first, hold_end, force_sigma_uN)
+    if gone == hold_end < n:
+        slipping, slipped_off = _loss(force_uN, first, first, force_sigma_uN)
+        if slipped_off < hold_end:
+            going, gone = slipping, slipped_off
+            hold_end, load_end = min(hold_end, gone), min(load_end, gone)
     return Branches(
         approach=range(first),
         loading=range(first, load_end),
         hold=range(load_end, hold_end),
         unloading=range(hold_end, gone),
         lost=range(gone, n),
-        onset_s=(float(time_s[first - 1]), float(time_s[first])) if first else None,
+        onset_s=(float(time_s[first - 1]), float(time_s[onset.late])) if first else None,
         turns_s=turns,
-        release_s=float(time_s[gone - 1] + time_s[gone]) / 2.0 if gone < n else None,
+        release_s=(float(time_s[going - 1]), float(time_s[gone])) if gone < n else None,
     )
 
 
@@ -110,30 +122,17 @@ def _smooth(values: Array) -> Array:
     return smooth
 
 
-def _onset(time_s: Array, force: Array, sigma: float) -> int:
-    """Index of the first sample in contact; 0 if the record begins there."""
-    found = _rise(force, sigma)
+def _onset(time_s: Array, force: Array, sigma: float) -> Departure:
+    """The first sample in contact; 0 if the record begins there."""
+    found = find_departure(force, sigma)
     if found is None:
-        return 0
-    first, base = found
-    # The sample before may have felt a part of its exposure: it belongs to the contact then.
-    if force[first - 1] > base + CLEAR * sigma:
-        first -= 1
+        return Departure(0, 0)
+    first = found.early
     top = int(np.argmax(force))
     growth = (force[top] - force[first]) / (time_s[top] - time_s[first]) if top > first else 0.0
     at_rest = np.polynomial.polynomial.polyfit(time_s[:first], force[:first], 1)[1]
-    return 0 if at_rest > _STARTS_IN_CONTACT * growth else first
-
-
-def _rise(force: Array, sigma: float) -> tuple[int, float] | None:
-    """First index at which a force leaves its recent mean for good, to either side; and this mean."""
-    total = np.concatenate([[0.0], np.cumsum(force)])
-    i = np.arange(_FEWEST_AT_REST, len(force) - 2)
-    before = np.maximum(i - _BASELINE, 0)
-    base = (total[i] - total[before]) / (i - before)
-    beyond = np.minimum.reduce([np.abs(force[i + k] - base) for k in range(3)]) > CLEAR * sigma
-    risen = np.flatnonzero(beyond)
-    return (int(i[risen[0]]), float(base[risen[0]])) if len(risen) else None
+    by_noise = sigma / float(np.std(time_s[:first]) * np.sqrt(first))
+    return Departure(0, 0) if at_rest > max(_STARTS_IN_CONTACT * growth, _CLEAR_SLOPE * by_noise) else found
 
 
 def _speeds(time_s: Array, deformation: Array, usual_um_s: float, sigma: float) -> Array:
@@ -203,14 +202,15 @@ def _holds(time_s: Array, deformation: Array, first: int, turn: int) -> bool:
                 and deformation[-3:].mean() > deformation[turn - 1] - 0.1 * depth)  # fmt: skip
 
 
-def _loss(force: Array, first: int, begin: int, sigma: float) -> int:
-    """Index from which on the force is back at its baseline, however that drifts; the number of samples if never."""
+def _loss(force: Array, first: int, begin: int, sigma: float) -> tuple[int, int]:
+    """First and last sample that may be the first at the baseline again, however that drifts; their number if none."""
     n = len(force)
     tail = force[-_FEWEST_AT_REST:]
     if begin >= n or np.ptp(tail) > 2.0 * CLEAR * sigma or n - begin <= _FEWEST_AT_REST:
         at_rest = float(np.mean(force[max(first - _BASELINE, 0) : max(first - 1, 1)])) if first else 0.0
         pressed = np.flatnonzero(np.abs(force[begin:] - at_rest) > CLEAR * sigma)
         gone = begin + (int(pressed[-1]) + 1 if len(pressed) else 0)
-        return gone if n - gone >= _SHORTEST_LOSS else n
-    found = _rise(force[begin:][::-1], sigma)
-    return begin if found is None else n - found[0]
+        gone = gone if n - gone >= _SHORTEST_LOSS else n
+        return gone, gone
+    found = find_departure(force[begin:][::-1], sigma)
+    return (begin, begin) if found is None else (n - found.late, n - found.early)

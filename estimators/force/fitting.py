@@ -208,7 +208,7 @@ def _start(prepared: Prepared, protocol: Protocol, problem: Problem) -> tuple[Ar
 def _slips(prepared: Prepared, protocol: Protocol) -> list[tuple[float, float]]:
     if SLIP not in protocol.groups:
         return [(0.0, 0.0)]
-    release = prepared.branches.release_s
+    release = prepared.branches.released_s
     if release is None:
         offsets = [share * prepared.depth_um for share in _SLIP_SHARES]
         return [(offset, alpha) for offset in offsets for alpha in _SLIP_RATES_PER_S]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ from microdrivers.estimators.force.branches import Branches
 from microdrivers.estimators.force.fit_motion import motion_everywhere
 from microdrivers.estimators.force.joint import BASE, Motion, force_of, motion_of, slopes_of
 from microdrivers.estimators.force.model import Array
-from microdrivers.estimators.force.outliers import named_outliers
-from microdrivers.estimators.force.plausibility import doubts
+from microdrivers.estimators.force.notes import notes_on
+from microdrivers.estimators.force.outliers import outliers
 from microdrivers.estimators.force.prepared import LOADING, UNLOADING, Indices, Prepared, SeenBefore
 from microdrivers.estimators.force.protocol_fit import (
     ProtocolFit,
@@ -31,13 +31,16 @@ from microdrivers.estimators.force.structure import StructureTest, structure_tes
 _SIMPLER = 1.1
 """Of the smallest error: what a protocol with fewer parameters may have and still be preferred."""
 
+_CLEARLY = 0.5
+"""Of the smallest error without a slip: what one leaves that is not well determined and is preferred all the same."""
+
 
 class IdentificationSettings(NamedTuple):
     """How to identify.
 
     Attributes:
         around_reversal: samples left out on either side of contact, reversals and release.
-        protocol: which one's model counts; None: the one that explains the record best.
+        protocol: which one's model counts; None: the one that explains the record best, see `Identification.best`.
     """
 
     around_reversal: int = 2
@@ -85,7 +88,9 @@ class Identification:
 
     Attributes:
         protocols: by name; those that the record allows: without an unloading only `loading`.
-        best: name of the one that explains both branches best, the simpler one where that makes no difference.
+        best: name of the one that explains both branches best: within noise and by likelihood, or else by the error,
+            the simpler one where that makes no difference. `slip_corrected` never is where its slip cannot be one
+            (`Slip.reason`); where that is only imprecise, if no other explains the record nearly as well.
         contact: where and when.
         slip: None without an unloading.
         branches: index ranges of the record, and instants of its reversals.
@@ -93,6 +98,7 @@ class Identification:
         misfit: test of the best protocol's residual structure.
         contact_duration_s: from contact to its loss or the end of the record.
         deformation_sigma_um, force_sigma_uN: noise used: as stated or, if clearly more was observed, as observed.
+        baseline_uN: the force out of contact, at every sample, as it was taken off; 0 where the record shows none.
         knots_s: spacing of the knots of the splines that the best protocol's trajectory follows; 0 for ramps.
         notes: what else should be known, in sentences.
     """
@@ -107,6 +113,7 @@ class Identification:
     contact_duration_s: float
     deformation_sigma_um: float
     force_sigma_uN: float
+    baseline_uN: Array
     knots_s: float
     notes: tuple[str, ...]
 
@@ -126,15 +133,16 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     check(record)
     prepared, on_ramps = settled(record, settings.around_reversal)
     fits = all_protocols(prepared, on_ramps)
-    protocols = {name: _protocol_fit(prepared, name, fit) for name, fit in fits.items()}
+    both_ways = "single" in fits
+    protocols = {name: _protocol_fit(prepared, name, fit, both_ways=both_ways) for name, fit in fits.items()}
     best = _best(protocols)
-    slip = _slip(prepared, protocols.get("slip_corrected"), best)
-    notes = _notes(record, prepared, both_ways="single" in protocols)
+    slip = _slip(prepared, protocols, best)
+    notes = notes_on(record, prepared, both_ways=both_ways)
     if settings.protocol not in {None, best}:
         notes.append(f"{settings.protocol} was asked for; {best} would be preferred")
         best = _asked_for(settings.protocol, protocols)
     chosen = protocols[best]
-    end_s = prepared.branches.release_s or float(prepared.time_s[-1])
+    end_s = prepared.branches.released_s or float(prepared.time_s[-1])
     return Identification(
         protocols=protocols,
         best=best,
@@ -152,12 +160,13 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
         contact_duration_s=end_s - chosen.contact_time_s,
         deformation_sigma_um=prepared.deformation_sigma_um,
         force_sigma_uN=prepared.force_sigma_uN,
+        baseline_uN=prepared.baseline_uN,
         knots_s=fits[best].spacing_s,
         notes=tuple(notes),
     )
 
 
-def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolFit:
+def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit, *, both_ways: bool) -> ProtocolFit:
     motion = motion_everywhere(prepared, fit)
     force, fitted = prepared.force_uN[prepared.used], force_of(fit.theta, motion)
     by_x, _ = slopes_of(fit.theta, motion)
@@ -177,7 +186,7 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
     misfit, structure = test(judged), test(fitted_to)
     ratio = _noise_ratio(left[fitted_to], noise[fitted_to])
     beyond = "its residual has structure" if fit.within_noise else f"{ratio:.3g} × noise"
-    weak = weak_parameters(
+    weak, imprecise = weak_parameters(
         prepared,
         fit.theta,
         fit.covariance,
@@ -197,25 +206,34 @@ def _protocol_fit(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolF
         condition_number=_condition(motion, fit.at),
         identifiable={key: key not in weak for key in names},
         weak=weak,
+        imprecise=imprecise,
         force_uN=_at_all_samples(prepared, fit, motion),
         residual_uN=float(np.hypot(prepared.force_sigma_uN, fit.discrepancy_uN)),
         within_noise=fit.within_noise,
         misfit=misfit,
-        deepest_um=float(np.max(motion.compression_um)),
-        **_fastest(prepared, fit, motion),
+        deepest_um=_deepest_um(prepared, motion),
+        **_fastest(prepared, fit, motion, both_ways=both_ways),
         likelihood_cost=solution.cost + fit.parameters * float(np.log(2 * solution.samples)),
         **named_parameters(fit.theta, fit.covariance),
     )
 
 
-def _fastest(prepared: Prepared, fit: Fit, motion: Motion) -> dict[str, float]:
+def _deepest_um(prepared: Prepared, motion: Motion) -> float:
+    """The reversals, which no fit uses, were pressed, too; single samples far off their neighbours were not."""
+    counts = prepared.measured.copy()
+    counts[outliers(prepared.deformation_um, prepared.deformation_sigma_um)] = False
+    in_contact = slice(prepared.branches.loading.start, prepared.branches.lost.start)
+    return float(np.max(_compression_um(prepared, motion)[in_contact][counts[in_contact]]))
+
+
+def _fastest(prepared: Prepared, fit: Fit, motion: Motion, *, both_ways: bool) -> dict[str, float]:
     """Largest speed while loading and while unloading, of the contact point or, where that is faster, of x."""
     none = np.zeros(len(prepared.used))
     slipping_um_s = -motion_of(fit.theta, prepared.time_s[prepared.used], none, none, none).velocity_um_s
     speeds = np.stack([motion.velocity_um_s, motion.velocity_um_s + slipping_um_s])
     in_um_s = float(np.max(speeds[:, prepared.branch == LOADING]))
     out = -speeds[:, prepared.branch == UNLOADING]
-    return {"fastest_um_s": in_um_s, "fastest_unloading_um_s": float(np.max(out)) if out.size else in_um_s}
+    return {"fastest_um_s": in_um_s, "fastest_unloading_um_s": float(np.max(out)) if both_ways else in_um_s}
 
 
 def _percent(left: Array, force: Array) -> float:
@@ -232,12 +250,18 @@ def _condition(motion: Motion, at: Indices) -> float:
     return ridge_fit(np.column_stack([v, x, x**3]), np.zeros(len(x))).condition_number
 
 
-def _at_all_samples(prepared: Prepared, fit: Fit, motion: Motion) -> Array:
-    """The model's force at every sample: speed and slip of the nearest used sample where a sample was left out."""
+def _compression_um(prepared: Prepared, motion: Motion) -> Array:
+    """x at every sample: zero and slip of the used ones next to it taken off where one was left out."""
     t, used = prepared.time_s, prepared.used
     taken_off = prepared.deformation_um[used] - motion.compression_um
-    x = prepared.deformation_um - np.interp(t, t[used], taken_off)
-    nearest = used.searchsorted(np.arange(len(t))).clip(max=len(used) - 1)
+    x: Array = prepared.deformation_um - np.interp(t, t[used], taken_off)
+    return x
+
+
+def _at_all_samples(prepared: Prepared, fit: Fit, motion: Motion) -> Array:
+    """The model's force at every sample: speed and slip of the nearest used sample where a sample was left out."""
+    used, x = prepared.used, _compression_um(prepared, motion)
+    nearest = used.searchsorted(np.arange(len(x))).clip(max=len(used) - 1)
     for part in (prepared.branches.loading, prepared.branches.hold, prepared.branches.unloading):
         inside = np.flatnonzero((used >= part.start) & (used < part.stop))
         if len(inside):
@@ -252,7 +276,7 @@ def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
     if "single" not in protocols:
         return "loading"
     names: list[ProtocolName] = ["single", "unloading_springs", "loading_only"]
-    if not {"slip", "slip_rate"} & set(protocols["slip_corrected"].weak):
+    if _slip_counts(protocols["slip_corrected"], [protocols[name] for name in names]):
         names.append("slip_corrected")
     # `loading_only` explains both branches no better than the protocols that look at both.
     within: list[ProtocolName] = [n for n in names if protocols[n].within_noise and n != "loading_only"]
@@ -260,6 +284,15 @@ def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
         return min(within, key=lambda name: protocols[name].likelihood_cost)
     least = min(protocols[name].error_percent for name in names)
     return next(name for name in names if protocols[name].error_percent <= _SIMPLER * least)
+
+
+def _slip_counts(slipped: ProtocolFit, without: Sequence[ProtocolFit]) -> bool:
+    """Whether a slip may explain a record: it is one, and determined or beyond doubt."""
+    weak = {"slip", "slip_rate"} & set(slipped.weak)
+    if not weak <= slipped.imprecise:
+        return False
+    clearly = slipped.error_percent <= _CLEARLY * min(fit.error_percent for fit in without)
+    return not weak or clearly or (slipped.within_noise and not any(fit.within_noise for fit in without))
 
 
 def _asked_for(name: ProtocolName | None, protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
@@ -270,16 +303,18 @@ def _asked_for(name: ProtocolName | None, protocols: Mapping[ProtocolName, Proto
     return name
 
 
-def _slip(prepared: Prepared, fit: ProtocolFit | None, best: ProtocolName) -> Slip | None:
+def _slip(prepared: Prepared, protocols: Mapping[ProtocolName, ProtocolFit], best: ProtocolName) -> Slip | None:
+    fit = protocols.get("slip_corrected")
     if fit is None:
         return None
     last = prepared.branches.unloading.stop
     lost = prepared.branches.release_s is not None
     left = float(np.mean(prepared.deformation_um[max(last - 2, 0) : last])) - fit.contact_um
-    why = list(dict.fromkeys(fit.weak[name] for name in ("slip", "slip_rate") if name in fit.weak))
+    why = _weakness_of_slip(fit)
     if fit.misfit.found:
         why.append("slip_corrected leaves more than noise")
-    if best != "slip_corrected":
+    as_well = protocols[best].within_noise or protocols[best].error_percent <= _SIMPLER * fit.error_percent
+    if best != "slip_corrected" and as_well:
         why.append(f"{best} explains the record without a slip, as well or better")
     return Slip(
         fit.slip_um,
@@ -292,32 +327,10 @@ def _slip(prepared: Prepared, fit: ProtocolFit | None, best: ProtocolName) -> Sl
     )
 
 
-def _notes(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) -> list[str]:
-    notes = [*doubts(prepared), *named_outliers(prepared)]
-    for what, stated, used, unit in (
-        ("deformation", record.deformation_sigma_um, prepared.deformation_sigma_um, "µm"),
-        ("force", record.force_sigma_uN, prepared.force_sigma_uN, "µN"),
-    ):
-        if stated > 0.0 and used > stated:
-            notes.append(f"the noise of the {what} is {used:.3g} {unit} as observed, {stated:.3g} {unit} as stated")
-    pulled = prepared.force_uN[prepared.used]
-    if np.sum(pulled < -6.0 * prepared.force_sigma_uN) >= 3:
-        notes.append(f"adhesion: the specimen pulls with up to {-pulled.min():.3g} µN, which the model does not have")
-    if prepared.contact.seen == "nothing":
-        notes.append("the record begins in contact, or noise hides where: the contact point is that of its own zero")
-    full = len(prepared.excluded.get("saturated", ()))
-    if full:
-        notes.append(f"the sensor was at the end of its range in {full} samples, which are left out")
-    parts = prepared.branches
-    if parts.release_s is not None and parts.turns_s and parts.release_s < parts.turns_s[0]:
-        notes.append(f"contact was lost at {parts.release_s:.2f} s, while the deformation still grew")
-    if not len(parts.unloading):
-        why = "the record has no unloading"
-        if parts.release_s is not None:
-            why = "no force above its noise was left once the tip had turned"
-        notes.append(f"{why}: only the loading is fitted")
-    elif not both_ways:
-        notes.append("the tip left the specimen soon after it turned back: only the loading is fitted")
-    elif parts.release_s is None:
-        notes.append("the record ends in contact")
-    return notes
+def _weakness_of_slip(fit: ProtocolFit) -> list[str]:
+    """Why offset and α are not determined; what is true of both is said once, anything else with its name."""
+    said: dict[str, list[str]] = {}
+    for name, which in (("slip", "offset in µm"), ("slip_rate", "α in 1/s")):
+        for reason in filter(None, fit.weak.get(name, "").split("; ")):
+            said.setdefault(reason, []).append(which)
+    return [reason if len(which) > 1 else f"{which[0]}: {reason}" for reason, which in said.items()]

@@ -59,6 +59,7 @@ class Motion(NamedTuple):
         position_um: as measured; as fitted where the measured one is a spike.
         sigma_um: standard deviation of one measured position.
         velocity_um_s, velocity_sigma_um_s: slope of the fit at that instant.
+        velocity_age_s: how long before that instant lies the middle of the positions fitted; negative if after.
         acceleration_um_s2: 0 unless it was asked for.
         begin_ns: beginning of the stretch without a corner that it belongs to.
         after_corner: whether that began with a corner rather than with the first position, a gap or a jump.
@@ -71,6 +72,7 @@ class Motion(NamedTuple):
     sigma_um: float
     velocity_um_s: float
     velocity_sigma_um_s: float
+    velocity_age_s: float
     acceleration_um_s2: float
     begin_ns: int
     after_corner: bool
@@ -208,6 +210,7 @@ class LocalMotion:
                     sigma_um,
                     line.velocity_um_s(t_s),
                     sigma_um * line.velocity_spread_per_s(t_s),
+                    t_s - line.middle_s,
                     2.0 * line.bend,
                     self._begin_ns,
                     self._after_corner,

@@ -216,11 +216,15 @@ def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -
         count = min(around, max(most, 1))
         if len(part) and begins:
             near[part.start : part.start + count] = True
+            if index == 0 and branches.onset_s is not None:
+                near[part.start : np.searchsorted(time_s, branches.onset_s[1])] = True
             until = time_s[part.start] + margins.begin_s[index]
             settled = min(int(np.searchsorted(time_s, until)), part.start + most)
             settling[part.start : settled] = True
         if len(part) and before_turn:
             near[max(part.stop - count, part.start) : part.stop] = True
+            if branches.release_s is not None and part.stop == branches.lost.start:
+                near[max(np.searchsorted(time_s, branches.release_s[0], side="right"), part.start) : part.stop] = True
             since = time_s[part.stop - 1] - margins.end_s[index]
             unsettled = max(int(np.searchsorted(time_s, since, side="right")), part.stop - most)
             settling[unsettled : part.stop] = True

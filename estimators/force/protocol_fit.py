@@ -59,7 +59,8 @@ class ProtocolFit:
         condition_number: of the scaled regressor of eq. (22) on the protocol's samples.
         identifiable: for k1, k2, b, m (and slip, slip_rate): the record determines it, and the model explains the
             samples that it is estimated from within their noise; otherwise the number is no property of the specimen.
-        weak: reasons, for those that it does not determine.
+        weak: reasons, for those that it does not determine. imprecise: of these, the ones of which no more is amiss
+            than that their intervals are wide.
         force_uN: F̂ at every sample of the record, baseline included; without contact the baseline.
         residual_uN: RMS of the force's own residual, the noise of the deformation taken off.
         within_noise: noise alone explains the residuals.
@@ -94,6 +95,7 @@ class ProtocolFit:
     condition_number: float
     identifiable: Mapping[str, bool]
     weak: Mapping[str, str]
+    imprecise: frozenset[str]
     force_uN: Array
     residual_uN: float
     within_noise: bool
@@ -154,8 +156,8 @@ def weak_parameters(
     slips: bool,
     structured_uN: float,
     misfit: str,
-) -> dict[str, str]:
-    """Reasons why the record does not determine a parameter, for those that it does not.
+) -> tuple[dict[str, str], frozenset[str]]:
+    """Why the record does not determine a parameter, for those that it does not; and those that are only imprecise.
 
     Args:
         prepared: the samples.
@@ -172,6 +174,7 @@ def weak_parameters(
     levers = {K1: x, K2: x**3, B_LOADING: v, SLIP: slopes_of(theta, motion)[0]}
     came_back = _came_back(prepared) if slips else []
     reasons: dict[str, str] = {}
+    imprecise = set()
     for name, place in _PLACES.items():
         if place in (SLIP, RATE) and not slips:
             continue
@@ -182,18 +185,21 @@ def weak_parameters(
             why.append(misfit)
         if value <= 0.0:
             why.append(f"the estimate {value:.3g} is not positive")
-        if not half <= _WIDEST * abs(value):
+        wide = not half <= _WIDEST * abs(value)
+        if wide:
             why.append(f"95 % interval {value - half:.3g} to {value + half:.3g}")
         if not systematic <= _WIDEST * abs(value):
             why.append(f"what the model leaves unexplained is worth {systematic:.2g} of it")
         if place in (SLIP, RATE):
             why += came_back
+        if wide and len(why) == 1:
+            imprecise.add(name)
         if why and name == "b":
             why.append(_confounded(prepared, theta, covariance, sigma))
         if why:
             reasons[name] = "; ".join(part for part in why if part)
     reasons["m"] = _no_mass(prepared, a)
-    return reasons
+    return reasons, frozenset(imprecise)
 
 
 def _came_back(prepared: Prepared) -> list[str]:

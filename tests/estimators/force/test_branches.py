@@ -28,7 +28,21 @@ def test_contact_reversals_and_release_are_found_to_the_frame(preset, hold_s):
     # The damper delays the tip's reversal by some tens of ms against the stage's.
     assert np.allclose(found.turns_s, [turn_s, turn_s + 2.0][: len(found.turns_s)], atol=0.1)
     last = truth.time_s[truth.in_contact][-1]
-    assert found.release_s == pytest.approx(last, abs=0.07)
+    assert found.released_s == pytest.approx(last, abs=0.07)
+
+
+@pytest.mark.parametrize("preset", ["single", "unloading_springs", "slip_corrected"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_hides_contact_and_release_no_farther_than_is_told(preset, seed):
+    push = Push(rest_s=3.0)
+    record = recorded(preset, push, Noise(force_uN=4.0), seed=seed)
+    found = find_branches(
+        record.time_s, record.deformation_um, record.force_uN, deformation_sigma_um=0.06, force_sigma_uN=4.0
+    )
+    truth = indented(PRESETS[preset], push)
+    assert found.onset_s[0] - 0.01 <= truth.contact_s <= found.onset_s[1] + 0.01
+    assert found.release_s[0] - 0.07 <= truth.time_s[truth.in_contact][-1] <= found.release_s[1] + 0.07
+    assert len(found.turns_s) == 1
 
 
 @given(st.floats(-30.0, -8.0), st.floats(60.0, 130.0), st.sampled_from([0.0, 1.5]), st.integers(0, 100))

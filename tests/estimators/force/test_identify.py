@@ -57,6 +57,22 @@ def test_a_specimen_of_the_paper_is_identified_by_its_protocol(preset):
     assert found.contact.contact_time_s == pytest.approx(indented(specimen, Push()).contact_s, abs=0.01)
 
 
+@pytest.mark.parametrize("noise", [Noise(force_uN=1.5), Noise(force_uN=5.0), Noise(drift_uN_per_s=1.0)], ids=str)
+@pytest.mark.parametrize("preset", MODELLED)
+def test_a_noisy_or_drifting_sensor_widens_intervals_and_moves_nothing(preset, noise):
+    found = identify(recorded(preset, Push(rest_s=3.0), noise))
+    fit, specimen = found.protocols[found.best], PRESETS[preset]
+    assert found.best == preset
+    assert not found.misfit.found
+    for value, sigma, true in (
+        (fit.k1_uN_per_um, fit.sigma_k1_uN_per_um, specimen.k1),
+        (fit.k2_uN_per_um3, fit.sigma_k2_uN_per_um3, specimen.k2),
+        (fit.b_loading_uN_s_per_um, fit.sigma_b_uN_s_per_um, specimen.b_loading),
+    ):
+        assert abs(value - true) < 4.0 * sigma
+    assert not any("adhesion" in note or "contact was lost" in note for note in found.notes)
+
+
 def test_slip_is_estimated_together_with_the_rest():
     found = identified("slip_corrected")
     assert found.slip is not None

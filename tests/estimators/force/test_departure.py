@@ -1,0 +1,47 @@
+"""A force that leaves its baseline steeply, slowly, or not at all, at any noise."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from microdrivers.estimators.force.departure import find_departure
+
+
+def force(step_uN, slope_uN, sigma_uN, *, at=150, length=600, seed=0, drift_uN=0.0):
+    """A baseline that drifts by so much a sample, from which a force rises."""
+    i = np.arange(length)
+    rising = np.where(i >= at, step_uN + slope_uN * (i - at), 0.0)
+    return rising + drift_uN * i + sigma_uN * np.random.default_rng(seed).standard_normal(length)
+
+
+@pytest.mark.parametrize("sigma_uN", [0.05, 1.0, 5.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_step_is_found_to_the_sample(sigma_uN, sign):
+    assert find_departure(sign * force(135.0, 0.5, sigma_uN), sigma_uN) == (150, 150)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0.05, 1.5), st.sampled_from([0.0, 3.0]), st.integers(60, 300), st.integers(0, 1000))
+def test_a_slow_rise_lies_within_what_is_told_of_it(slope_in_sigmas, step_in_sigmas, at, seed):
+    found = find_departure(force(3.0 * step_in_sigmas, 3.0 * slope_in_sigmas, 3.0, at=at, seed=seed), 3.0)
+    assert found is not None
+    # Of three standard deviations, and a noise that may have one sample look like its neighbour.
+    assert found.early - 5 <= at <= found.late + 5
+
+
+def test_the_slower_it_rises_the_less_is_told():
+    widths = [
+        np.mean([late - early for early, late in (find_departure(force(0.0, s, 3.0, seed=n), 3.0) for n in range(20))])
+        for s in (2.0, 0.5, 0.1)
+    ]
+    assert widths[0] < widths[1] < widths[2]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_leaves_no_baseline(seed):
+    assert find_departure(force(0.0, 0.0, 3.0, seed=seed), 3.0) is None
+
+
+def test_a_slow_drift_of_a_quiet_sensor_leaves_no_baseline():
+    assert find_departure(force(0.0, 0.0, 0.05, drift_uN=0.05 / 30.0), 0.05) is None
