@@ -251,7 +251,7 @@ def _condition(motion: Motion, at: Indices) -> float:
 
 
 def _compression_um(prepared: Prepared, motion: Motion) -> Array:
-    """x at every sample: zero and slip of the used ones next to it taken off where one was left out."""
+    """The compression x at every sample: zero and slip of the used ones next to it taken off where one was left out."""
     t, used = prepared.time_s, prepared.used
     taken_off = prepared.deformation_um[used] - motion.compression_um
     x: Array = prepared.deformation_um - np.interp(t, t[used], taken_off)

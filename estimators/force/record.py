@@ -36,6 +36,9 @@ _PRESSED_AGAIN, _LET_GO, _CAME_BACK = 0.5, 0.25, 0.3
 """Shares: of the force's range above which a tool presses, and below which it has let go; of the deformation's range by
 which it must have come back in between."""
 
+_FEW_LEVELS = 1.0 / 3.0
+"""Of the number of samples: so few different values are rounded ones."""
+
 _USABLE_SHARE = 0.5
 _PRESSES = 0.02
 _UNITS = "give time_s in s, deformation in µm and force in µN (1 mN is 1000 µN)"
@@ -90,13 +93,19 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
 
 
 def white_sigma(values: Array) -> float:
-    """Standard deviation of the white noise on a smooth curve, from third differences; robust against its kinks."""
+    """Standard deviation of the white noise on a smooth curve, from third differences; robust against its kinks.
+
+    At least that of the rounding, where few levels repeat.
+    """
     third = np.diff(values, 3)
     third = third[np.isfinite(third)]
     if len(third) < FEWEST_SAMPLES // 2:
         return float("nan")
     # Third differences of white noise have variance 20; the median of |normal| is 0.6745 standard deviations.
-    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+    seen = float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+    levels = np.unique(values[np.isfinite(values)])
+    rounded = 1 < len(levels) < _FEW_LEVELS * len(values)
+    return max(seen, float(np.min(np.diff(levels))) / np.sqrt(12.0)) if rounded else seen
 
 
 def check(record: IndentationRecord) -> None:

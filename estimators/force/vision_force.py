@@ -18,11 +18,14 @@ from microdrivers.estimators.force.model import (
     stiffness_uN_per_um,
 )
 
-OUTSIDE_RANGE, LOST = "OUTSIDE_RANGE", "LOST"
+OUTSIDE_RANGE, LOST, NO_VELOCITY = "OUTSIDE_RANGE", "LOST", "NO_VELOCITY"
+MAY_BE_RELEASED = "MAY_BE_RELEASED"
 
 _TOUCH_SIGMAS = 5.0
 _RANGE_SIGMAS = 5.0
 _AT_REST_UM = 1.0
+_MOVES_SIGMAS, _MOVES_SHARE = 5.0, 0.1
+"""What is no rest: a speed beyond its noise, and beyond this share of the fastest since the contact."""
 
 
 class VisionForceSettings(NamedTuple):
@@ -32,8 +35,10 @@ class VisionForceSettings(NamedTuple):
         lag: frames that must follow one before its force is published, ≥ 4: what it takes to see on which side of a
             reversal a frame lies. At 30 Hz, 5 frames are 167 ms.
         window: frames in the straight fit that gives the velocity, fewer after a corner of the motion. Where the speed
-            changes smoothly, the velocity is that of `(window + 1)/2 − lag` frames before.
-        max_gap_s: frames further apart than this give no velocity across the gap.
+            changes smoothly, the velocity is that of `(window + 1)/2 − lag` frames before, and `sigma_uN` contains what
+            that hides.
+        max_gap_s: frames further apart than this give no velocity across the gap, and no force if the model has a
+            damper: a camera at fewer than `1/max_gap_s` frames a second tells none, only `NO_VELOCITY`.
     """
 
     lag: int = 5
@@ -48,8 +53,14 @@ class VisionForce:
     exceeds what noise explains. It ends when the model's force is used up; it is never negative. The slip of eq. (26)
     runs from the instant at which the deformation began. The mass is left out: a camera tells no acceleration.
 
-    `sigma_uN` adds up the model's covariance and residual, the noise of the deformation and that of the velocity.
+    `sigma_uN` adds up the model's covariance and residual, the noise of the deformation and that of the velocity, and
+    the damper's force of such changes of speed as the velocity lags behind: as seen in the last two windows.
     A frame that is lost is published at once, and before it all that wait, by what was known until then.
+
+    Flags: `LOST`, no deformation was seen; `NO_VELOCITY`, there is no velocity and so no force, both NaN;
+    `OUTSIDE_RANGE`, deeper or faster than the model was characterised; `MAY_BE_RELEASED`, the specimen rests on its
+    way back with a force left by the model, beyond noise: the tool holds it there, or has left a specimen that lies
+    farther in than the model has it, which a camera cannot tell apart.
 
     Args:
         model: the identified specimen.
@@ -67,10 +78,13 @@ class VisionForce:
         self._motion = LocalMotion(
             MotionSettings(lag=self.settings.lag, window=self.settings.window, max_gap_s=self.settings.max_gap_s)
         )
+        self._lag = _Lag(self.settings.window)
         self._waiting: deque[DeformationSample] = deque()
         self._newest_ns: int | None = None
         self._touches = False
         self._touched_ns: int | None = None
+        self._fastest_um_s = 0.0
+        self._came_back = False
         self._seq = 0
 
     @property
@@ -109,10 +123,14 @@ class VisionForce:
         frame = self._waiting.popleft()
         x_um, v_um_s = self._compression(motion)
         seen_uN = self._seen_sigma_uN(motion, x_um, v_um_s)
-        noise_uN = math.hypot(seen_uN, self.model.residual_uN)
+        hidden_uN = self._damper(v_um_s) * self._lag.hidden_um_s(motion)
+        if not math.isfinite(seen_uN):
+            return self._publish(frame, math.nan, math.nan, math.nan, {NO_VELOCITY})
+        noise_uN = math.hypot(seen_uN, hidden_uN, self.model.residual_uN)
         raw_uN = float(force_uN(self.model, x_um, v_um_s, adhesion=True))
         if not self._touches and raw_uN > _TOUCH_SIGMAS * seen_uN:
             self._touches = True
+            self._fastest_um_s = 0.0
             if self._touched_ns is None:
                 self._touched_ns = motion.begin_ns if motion.after_corner else motion.t_ns
                 x_um, v_um_s = self._compression(motion)
@@ -124,8 +142,18 @@ class VisionForce:
                 self._touched_ns = None
             return self._publish(frame, 0.0, noise_uN, motion.velocity_um_s, set())
         flags = {OUTSIDE_RANGE} if self._is_outside(motion, x_um, v_um_s) else set()
+        if self._rests_on_its_way_back(motion) and raw_uN > _TOUCH_SIGMAS * seen_uN:
+            flags.add(MAY_BE_RELEASED)
         sigma_uN = math.hypot(noise_uN, self._model_sigma_uN(x_um, v_um_s))
         return self._publish(frame, max(raw_uN, 0.0), sigma_uN, motion.velocity_um_s, flags)
+
+    def _rests_on_its_way_back(self, motion: Motion) -> bool:
+        v_um_s = motion.velocity_um_s
+        self._fastest_um_s = max(self._fastest_um_s, abs(v_um_s))
+        if abs(v_um_s) > max(_MOVES_SIGMAS * motion.velocity_sigma_um_s, _MOVES_SHARE * self._fastest_um_s):
+            self._came_back = v_um_s < 0.0
+            return False
+        return self._came_back
 
     def _compression(self, motion: Motion) -> tuple[float, float]:
         """Compression x of eq. (21), µm, and its rate, µm/s, by eq. (26)."""
@@ -139,10 +167,13 @@ class VisionForce:
 
     def _seen_sigma_uN(self, motion: Motion, x_um: float, v_um_s: float) -> float:
         """Standard deviation from the noise of the deformation and of the velocity."""
-        damper = self.model.b_loading_uN_s_per_um if v_um_s > 0.0 else self.model.b_unloading_uN_s_per_um
+        damper = self._damper(v_um_s)
         from_velocity = damper * motion.velocity_sigma_um_s if damper else 0.0
         from_position = float(stiffness_uN_per_um(self.model, x_um)) * motion.sigma_um
         return math.hypot(from_position, from_velocity)
+
+    def _damper(self, v_um_s: float) -> float:
+        return self.model.b_loading_uN_s_per_um if v_um_s > 0.0 else self.model.b_unloading_uN_s_per_um
 
     def _model_sigma_uN(self, x_um: float, v_um_s: float) -> float:
         """Standard deviation from the parameters' covariance; that of the damper while it damps like in loading."""
@@ -174,3 +205,26 @@ class VisionForce:
             deformation_um=frame.deformation_um,
             velocity_um_s=velocity_um_s,
         )
+
+
+class _Lag:
+    """By how much a velocity may be off because it is that of an earlier instant: as the speed has changed lately.
+
+    Told by velocities that have no position in common, and no corner between; what their noise explains is taken off.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._told: deque[Motion] = deque(maxlen=window)
+        self._change_um_s2: deque[float] = deque(maxlen=2 * window)
+
+    def hidden_um_s(self, motion: Motion) -> float:
+        """Standard deviation of that, for the next motion told."""
+        if self._told and self._told[-1].begin_ns != motion.begin_ns:
+            self._told.clear()
+        if len(self._told) == self._told.maxlen:
+            before = self._told[0]
+            noise = motion.velocity_sigma_um_s**2 + before.velocity_sigma_um_s**2
+            change_um_s = math.sqrt(max((motion.velocity_um_s - before.velocity_um_s) ** 2 - noise, 0.0))
+            self._change_um_s2.append(change_um_s * NS_PER_S / (motion.t_ns - before.t_ns))
+        self._told.append(motion)
+        return abs(motion.velocity_age_s) * max(self._change_um_s2, default=0.0)

@@ -151,3 +151,9 @@ def test_white_sigma_sees_the_noise_and_not_the_curve():
 def test_runs_are_half_open():
     assert runs(np.array([True, False, True, True])) == [(0, 1), (2, 4)]
     assert runs(np.array([False])) == []
+
+
+def test_noise_of_rounded_values_is_that_of_the_rounding():
+    force = 5.0 * np.round(np.linspace(0.0, 600.0, 900) / 5.0)
+    assert white_sigma(force) == pytest.approx(5.0 / np.sqrt(12.0))
+    assert white_sigma(np.linspace(0.0, 600.0, 900)) < 1e-9

@@ -305,3 +305,42 @@ def test_longer_lag_is_allowed_and_a_shorter_one_refused() -> None:
     assert error_percent(found, record) <= 5.0
     with pytest.raises(ValueError, match="lag"):
         VisionForce(PRESETS["single"], VisionForceSettings(lag=1))
+
+
+def test_sigma_contains_what_the_lag_of_the_velocity_hides() -> None:
+    preset = PRESETS["single"]
+    t = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
+    since = np.maximum(t - CONTACT_S, 0.0)
+    angle = 2.0 * np.pi * since / 4.0
+    x = 3.0 * since + 2.0 * 4.0 / (2.0 * np.pi) * (1.0 - np.cos(angle))
+    v = np.where(since > 0.0, 3.0 + 2.0 * np.sin(angle), 0.0)
+    record = Record(t, x, preset.k1_uN_per_um * x + preset.k2_uN_per_um3 * x**3 + preset.b_loading_uN_s_per_um * v)
+    found = fed(VisionForce(preset), frames(record))
+    # The first change of speed is seen a window later.
+    seen = [f for f in found if f.t_ns > 3.0e9]
+    truth = record.force_uN[len(found) - len(seen) : len(found)]
+    off = np.array([abs(f.force_uN - force) for f, force in zip(seen, truth, strict=True)])
+    assert np.sqrt(np.mean(off**2)) > 7.0
+    assert np.mean(off > 3.0 * np.array([f.sigma_uN for f in seen])) < 0.02
+
+
+def test_a_camera_too_slow_for_a_velocity_tells_no_force_but_that_of_springs() -> None:
+    preset = PRESETS["single"]
+    slow = [frame(k, k / 3.0, 5.0 / 3.0 * max(k - 6, 0)) for k in range(60)]
+    found = fed(VisionForce(preset), slow)
+    assert len(found) > 50
+    assert all(math.isnan(f.force_uN) and f.flags == {"NO_VELOCITY"} for f in found)
+    springs = preset._replace(b_loading_uN_s_per_um=0.0, b_unloading_uN_s_per_um=0.0)
+    told = fed(VisionForce(springs), slow)
+    assert told[-1].force_uN == pytest.approx(4.5161 * told[-1].deformation_um, rel=0.3)
+
+
+def test_a_force_left_over_where_the_specimen_rests_on_its_way_back_is_flagged() -> None:
+    slipping = PRESETS["slip_corrected"]
+    record = indentation(slipping, hold_s=3.0)
+    without = slipping._replace(slip_um=0.0, slip_rate_per_s=0.0)
+    found = fed(VisionForce(without), frames(record))
+    said = [f for f in found if "MAY_BE_RELEASED" in f.flags]
+    left_s = record.t_s[np.flatnonzero(record.force_uN > 0.0)[-1]]
+    assert len(said) > 0.8 * np.sum(record.t_s[: len(found)] > left_s)
+    assert all(f.t_ns > 1e9 * (left_s - 0.1) and f.force_uN > 100.0 for f in said)
