@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from microdrivers.estimators.force.departure import find_departure
 
@@ -21,13 +19,15 @@ def test_a_step_is_found_to_the_sample(sigma_uN, sign):
     assert find_departure(sign * force(135.0, 0.5, sigma_uN), sigma_uN) == (150, 150)
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.floats(0.05, 1.5), st.sampled_from([0.0, 3.0]), st.integers(60, 300), st.integers(0, 1000))
-def test_a_slow_rise_lies_within_what_is_told_of_it(slope_in_sigmas, step_in_sigmas, at, seed):
-    found = find_departure(force(3.0 * step_in_sigmas, 3.0 * slope_in_sigmas, 3.0, at=at, seed=seed), 3.0)
-    assert found is not None
-    # Of three standard deviations, and a noise that may have one sample look like its neighbour.
-    assert found.early - 5 <= at <= found.late + 5
+@pytest.mark.parametrize("slope_in_sigmas", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("step_in_sigmas", [0.0, 3.0])
+def test_a_slow_rise_lies_within_what_is_told_of_it(slope_in_sigmas, step_in_sigmas):
+    outside = 0
+    for seed in range(100):
+        at = 60 + seed
+        early, late = find_departure(force(3.0 * step_in_sigmas, 3.0 * slope_in_sigmas, 3.0, at=at, seed=seed), 3.0)
+        outside += not early <= at <= late
+    assert outside <= 3
 
 
 def test_the_slower_it_rises_the_less_is_told():
