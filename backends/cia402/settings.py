@@ -131,6 +131,11 @@ class FineStageSettings(ToolCarrierSettings):
         return tuple(names)
 
     @property
+    def largest_speed_um_s(self) -> float:
+        """Of any axis."""
+        return max(axis.max_speed_um_s for axis in (self.axes.x, self.axes.y, self.axes.z))
+
+    @property
     def travel_um(self) -> Mapping[str, Range]:
         """Travel of x, y and z."""
         return {axis: getattr(self.axes, axis).travel_um for axis in _AXES}

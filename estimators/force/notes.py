@@ -41,7 +41,7 @@ def notes_on(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) 
     if full:
         notes.append(f"the sensor was at the end of its range in {full} samples, which are left out")
     parts = prepared.branches
-    if parts.released_s is not None and parts.turns_s and parts.released_s < parts.turns_s[0]:
+    if parts.release_s is not None and parts.turns_s and parts.release_s[1] < parts.turns_s[0]:
         notes.append(f"contact was lost at {parts.released_s:.2f} s, while the deformation still grew")
     if not len(parts.unloading):
         why = "the record has no unloading"

@@ -16,7 +16,9 @@ FoundBy = Literal["order", "size"]
 LAGS = 20
 """Samples over which residuals are correlated with each other."""
 
-SIGNIFICANT_P = 0.01
+SIGNIFICANT_P, _LEAST_P = 0.01, 1e-9
+"""Structure is found below the first; below the second the figure says no more."""
+
 _BLOCK = 15
 _EXCESS = 4.0
 """Of the noise's variance: so much left over is no noise, however it is ordered."""
@@ -75,11 +77,14 @@ def structure_test(
     found_by: FoundBy | None = None
     if found:
         found_by = "order" if p_value < SIGNIFICANT_P else "size"
-    how = f"p = {p_value:.1g}"
+    how = [f"p < {_LEAST_P:g}" if p_value < _LEAST_P else f"p = {p_value:.1g}"]
     if excess:
-        times = float(np.sqrt(np.mean(left_over_uN**2))) / noise
-        how = f"{times:.3g} times what noise leaves, {how} of its order"
-    figures = f"{structured:.2g} µN RMS of slow residual beside {noise:.2g} µN of noise, {how}"
+        # What its size has shown to be no noise, an order that looks like noise does not take back.
+        how = [f"{float(np.sqrt(np.mean(left_over_uN**2))) / noise:.3g} times what noise leaves"] + [
+            f"{each} of its order" for each in how if p_value < SIGNIFICANT_P
+        ]
+    slow = f"{structured:.2g} µN RMS of slow residual" if structured else "nothing slow"
+    figures = ", ".join([f"{slow} beside {noise:.2g} µN of noise", *how])
     if found:
         text = f"misfit: the residual has structure that this model does not have ({figures})"
     elif excess:

@@ -36,7 +36,7 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
 
     files = find_recordings(runs)
     progress = TerminalProgress()
-    progress.step(f"{len(files)} recordings")
+    progress.step(_recordings(len(files)))
     try:
         report = analyse_recordings(
             files, out, jobs=jobs, dask=dask,
@@ -49,9 +49,14 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
     finally:
         progress.close()
     resumed = f", {report.resumed} of them from an earlier run" if report.resumed else ""
-    click.echo(f"{out}: {len(report.rows)} recordings{resumed}, {report.failed} with errors")
+    incomplete = f", {report.incomplete} with losses (see `losses` and `dropped`)" if report.incomplete else ""
+    click.echo(f"{out}: {_recordings(len(report.rows))}{resumed}, {report.failed} with errors{incomplete}")
     for row in report.rows:
         if row["error"] is not None:
             click.echo(f"  {row['file']}: {row['error']}", err=True)
     if report.failed == len(report.rows):
         sys.exit(EXIT_ERROR)
+
+
+def _recordings(number: int) -> str:
+    return "1 recording" if number == 1 else f"{number} recordings"

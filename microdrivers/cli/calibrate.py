@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.exit_codes import EXIT_INTERRUPTED
+from microdrivers.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK
 from microdrivers.cli.options import FiniteRange, given, refuse_options_given
 from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
@@ -202,4 +202,7 @@ def _run(source: OpticsSource, settings: CalibratorSettings, known: dict[str, An
         "calibration.yaml": result.write_calibration,
         "report.html": partial(write_optics_report, result),
     }
-    return output.finish(result, partial(optics_summary, result), files, complete=run.complete)
+    status = output.finish(result, partial(optics_summary, result), files, complete=run.complete)
+    # A run that ended as planned, with a result that is none of its last zoom; the result's notes say why.
+    is_outdated = run.complete and not result.complete and not run.past_run.ended_by
+    return status or (EXIT_ERROR if is_outdated else EXIT_OK)

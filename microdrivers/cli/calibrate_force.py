@@ -50,7 +50,11 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
     "--leave-out", type=click.IntRange(0, 20), default=2, show_default=True,
     help="Samples not fitted on either side of contact, reversals and release.",
 )  # fmt: skip
-@click.option("--protocol", type=click.Choice(PROTOCOLS), help="Whose model counts; default: the one that fits best.")
+@click.option(
+    "--protocol", type=click.Choice(PROTOCOLS),
+    help="Whose model counts; default: within noise the likeliest, else that of the least error, the simpler one if "
+    "alike; a slip only if what slipped has stayed, and if it is determined or nothing else fits nearly as well.",
+)  # fmt: skip
 @click.option("--yes", is_flag=True, help="Do not ask whether specimen and probe are ready.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-force/.")
 @click.option("--real-time", is_flag=True, help="Run an emulated rig in real time instead of as fast as possible.")
@@ -142,10 +146,10 @@ def _refuse_rig_options(table: Path | None, replay: Path | None) -> None:
 
     if table is not None and replay is not None:
         raise ConfigError("--csv and --replay exclude each other", remedy="leave out one of them")
-    option, of_its_own = ("--csv", "specimen") if table is not None else ("--replay", "check")
+    option, describes, tries = ("--csv", ("specimen",), ()) if table is not None else ("--replay", (), ("check",))
     refuse_options_given(
-        f"{option} replaces the rig", allowed=("table", "replay", "out", "as_json", "yes", of_its_own),
-        of_analysis=OF_ANALYSIS,
+        f"{option} replaces the rig", allowed=("table", "replay", "out", "as_json", "yes", *describes),
+        of_analysis=(*OF_ANALYSIS, *tries),
     )  # fmt: skip
 
 

@@ -119,7 +119,8 @@ def _row(name: str, topic: dict[str, Any]) -> list[str]:
     def seconds(value: float | None) -> str:
         return "–" if value is None else f"{value:.3f}"
 
-    rate = "–" if topic["rate_hz"] is None else f"{topic['rate_hz']:.4g} Hz"
+    tells_rate = topic["rate_hz"] is not None and topic["count"] > 2  # of two events, a rate says nothing
+    rate = f"{topic['rate_hz']:.4g} Hz" if tells_rate else "–"
     return [
         name, topic["sample_type"], str(topic["count"]), rate, seconds(topic["first_s"]), seconds(topic["last_s"]),
         *(str(topic[key]) for key in ("missing", "dropped", "unsorted")),

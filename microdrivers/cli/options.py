@@ -55,11 +55,20 @@ def refuse_options_given(reason: str, *, allowed: Collection[str], of_analysis: 
     """
     from microdrivers.core.errors import ConfigError
 
-    parameters = {p.name: max(p.opts, key=len) for p in click.get_current_context().command.params if p.name}
-    void = [option for name, option in parameters.items() if given(name) and name not in {*allowed, *of_analysis}]
+    context = click.get_current_context()
+    void = [
+        _named(p, context.params.get(p.name))
+        for p in context.command.params
+        if p.name and given(p.name) and p.name not in {*allowed, *of_analysis}
+    ]
     if void:
-        tries = [option for name, option in parameters.items() if name in of_analysis]
+        tries = [_named(p, not p.default) for p in context.command.params if p.name in of_analysis]
         other = f"; what can be tried on old data: {', '.join(tries)}" if tries else ""
         raise ConfigError(
             f"{reason}, and there is no experiment to drive", remedy=f"leave out {', '.join(void)}{other}"
         )
+
+
+def _named(parameter: click.Parameter, value: Any) -> str:
+    """The option that gives that value: of a pair such as --record/--no-record, one or the other."""
+    return max(parameter.secondary_opts if parameter.secondary_opts and value is False else parameter.opts, key=len)

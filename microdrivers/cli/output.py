@@ -42,12 +42,19 @@ def write_results(folder: Path, files: Mapping[str, Callable[[Path], object]]) -
     """
     from microdrivers.recording.output import whole_file
 
+    written: list[str] = []
     failed = False
     for name, write in files.items():
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with whole_file(folder / name) as part:
                 write(part)
+            written.append(name)
+        except KeyboardInterrupt:
+            click.echo(f"\n{folder}/ holds {', '.join(written) or 'nothing'} and lacks {name}", err=True)
+            if written:
+                click.echo("what is there stays: choose another --out folder to run it again", err=True)
+            raise
         except OSError as error:
             failed = True
             click.secho("error: ", fg="red", bold=True, nl=False, err=True)

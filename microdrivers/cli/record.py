@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LINE_PERIOD_S = 1.0
 _PLAIN_LINE_PERIOD_S = 10.0
+_LOOK_PERIOD_S = 0.1
 _HOUR_S, _DAY_S = 3600.0, 86400.0
 
 
@@ -163,16 +164,19 @@ def _rate_hz(device: Device[Any]) -> float:
 
 
 def _run(clock: Clock, recorder: Recorder, duration_s: float | None) -> None:
-    """Wait, and tell how it goes."""
+    """Wait until the time is over or the file cannot be written, and tell how it goes."""
     live = sys.stderr.isatty()
     period_s = _LINE_PERIOD_S if live else _PLAIN_LINE_PERIOD_S
     begin_ns = before_ns = clock.now_ns()
     before: dict[str, int] = {}
     end_s = float("inf") if duration_s is None else duration_s
     try:
-        while (elapsed_s := (clock.now_ns() - begin_ns) / 1e9) < end_s:
-            clock.sleep(min(period_s, end_s - elapsed_s))
+        while (elapsed_s := (clock.now_ns() - begin_ns) / 1e9) < end_s and not recorder.stopped:
+            clock.sleep(min(_LOOK_PERIOD_S, end_s - elapsed_s))
             now_ns = clock.now_ns()
+            over = now_ns - begin_ns >= end_s * 1e9 or recorder.stopped
+            if now_ns - before_ns < period_s * 1e9 and not over:
+                continue
             messages = {topic: count.messages for topic, count in recorder.counts.items()}
             width = shutil.get_terminal_size().columns - 1 if live else sys.maxsize
             line = _line(recorder, messages, before, (now_ns - before_ns) / 1e9, (now_ns - begin_ns) / 1e9, width)

@@ -34,6 +34,7 @@ def repair(file: Path, out: Path | None) -> None:
     if not report.losses:
         click.echo("nothing was lost")
         return
-    click.echo(f"lost {report.lost_bytes} of {report.size} bytes:")
+    # Of bytes that never came to the file, nothing is known.
+    click.echo(f"lost {report.lost_bytes} of {report.size} bytes:" if report.lost_bytes else "lost:")
     for loss in report.losses:
         click.echo(f"  {loss}")

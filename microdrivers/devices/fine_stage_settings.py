@@ -59,6 +59,11 @@ class ToolCarrierSettings(DeviceSettings):
         """Travel of x, y and z."""
 
     @property
+    def largest_speed_um_s(self) -> float:
+        """Of any axis; infinite if the settings do not tell."""
+        return math.inf
+
+    @property
     def homing_ends_um(self) -> Mapping[str, float]:
         """Where axes stand after a search for references, of those of which the settings tell."""
         return {}

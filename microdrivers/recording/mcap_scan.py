@@ -24,7 +24,8 @@ from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
 from microdrivers.recording.mcap_writer import CHUNK, MAGIC, MESSAGE, RECORD
 
-NOT_ENDED = "the recording was not ended: its last 0.1 s may be missing"
+NOT_ENDED = "the recording was not ended"
+_END_MISSING = f"{NOT_ENDED}: at most its last 0.1 s are missing if its program was killed, more if its disk was full"
 
 _NO_SUMMARY = "the file's summary is damaged or cut off, or something follows it"
 _INDEX = struct.Struct("<BQHI")
@@ -182,7 +183,7 @@ class McapScan:
             else:
                 offset += length
         if self.size:
-            self.losses.append(Loss(self.size, 0, NOT_ENDED))
+            self.losses.append(Loss(self.size, 0, _END_MISSING))
 
     def _take_up(self, head: bytes, offset: int, length: int) -> bool:
         """Take up the record that begins with `head`; False if it is damaged, and perhaps its length too."""

@@ -53,7 +53,8 @@ class Recording:
     """A recording that was opened; its samples are read as they are asked for.
 
     Attributes:
-        header: where it comes from. clock: how its times relate to the calendar's; None if that is damaged.
+        header: where it comes from. clock: how its times relate to the calendar's, as the last record of it that is
+            intact says; None if none is.
         complete: whether it was ended; if not, its writer was killed or the file was cut off, perhaps before a repair.
 
     Raises:
@@ -69,9 +70,7 @@ class Recording:
         self._told = list(_told_losses(self._scan))
         self.complete = self._scan.complete and not any(NOT_ENDED in loss.what for loss in self._told)
         self.header = read_header(self._scan)
-        clocks = [record.metadata for record in self._scan.metadata if record.name == CLOCK_RECORD]
-        read = [clock for data in clocks if (clock := from_metadata(data, ClockMapping)) is not None]
-        self.clock = read[-1] if read else None
+        self.clock = read_clock_record(self._scan)
         self._damaged: dict[int, Loss] = {}
         self._unreadable: dict[tuple[int, int], str] = {}
         self._frames: dict[int, tuple[str, int, int]] = {}
@@ -300,6 +299,18 @@ def _holds_an_unwanted_image(place: ChunkPlace, actions: Mapping[int, object | N
     return len(numbers) == 2 and all(count == 1 and actions.get(number, place) is None for number, count in numbers)
 
 
+def read_clock_record(scan: McapScan) -> ClockMapping | None:
+    """The last record of the clock that is intact; of others a loss is told."""
+    records = [record.metadata for record in scan.metadata if record.name == CLOCK_RECORD]
+    read = [from_metadata(data, ClockMapping) for data in records]
+    intact = [clock for clock in read if clock is not None]
+    if len(intact) < len(read):
+        known = "another one is intact" if intact else "how its times relate to the calendar's is not known"
+        end = " of its end" if intact and read[-1] is None else ""
+        scan.losses.append(Loss(0, 0, f"the recording's clock record{end} is damaged: {known}"))
+    return intact[-1] if intact else None
+
+
 def read_header(scan: McapScan) -> RecordingHeader:
     """The recording's header, if the file is one.
 
@@ -313,6 +324,8 @@ def read_header(scan: McapScan) -> RecordingHeader:
     headers = [header for data in records if (header := from_metadata(data, RecordingHeader)) is not None]
     if headers:
         _check_version(file, headers[0].schema_version, headers[0].microdrivers)
+        if len(headers) < len(records):
+            scan.losses.append(Loss(0, 0, "one of the recording's headers is damaged: another one is intact"))
         return headers[0]
     for data in records:
         number = data.get("schema_version", "")

@@ -56,9 +56,9 @@ class Recorder:
         clock: of the rig.
         header: where the recording comes from.
         topics: names or patterns; default: all but the bytes on wires (`*/wire`).
-        on_failure: what happens when the file can no longer be written (a full disk): `stop` raises `RecordingFailed`
-            out of the main program's next wait on the clock; `go_on` counts what is lost, says so once, and writes
-            again as soon as that is possible.
+        on_failure: what happens when the file can no longer be written (a full disk): what is lost is counted, said
+            once, and the file written again as soon as that is possible. With `stop`, `stopped` asks the main program
+            to end the recording, and `close` raises `RecordingFailed`.
         compress_images: without loss (zstd); 3 to 10 ms of processor time a megapixel.
 
     Attributes:
@@ -135,6 +135,14 @@ class Recorder:
         return self._failure
 
     @property
+    def stopped(self) -> bool:
+        """Whether the main program is to end the recording: the file could not be written, and `on_failure` is `stop`.
+
+        It is asked, not interrupted: an error out of its next wait might come while it tells a device to stop.
+        """
+        return self._failure is not None and self._on_failure == "stop"
+
+    @property
     def disturbance(self) -> str:
         """What somebody else has done to the file since it was made; empty if neither its name nor its size tells."""
         now = _status(self.file)
@@ -182,7 +190,7 @@ class Recorder:
         self._write_waiting()
         with self._write_lock:
             self._closed = True
-            stopped = self._failure if self._on_failure == "stop" else None
+            stopped = self._failure if self.stopped else None
             failure = None if stopped is None else stopped.strerror or str(stopped)
             try:
                 self._out.finish(read_clock(self._clock), now_ns=self._clock.now_ns(), failure=failure)
@@ -193,8 +201,11 @@ class Recorder:
         if dropped:
             listed = ", ".join(f"{topic} {number}" for topic, number in dropped.items())
             _log.error("%s: %d samples were not recorded: %s", self.file, self.dropped, listed)
-        if self._failure is not None and self._on_failure == "stop":
-            raise self._failed(self._failure)
+        if self._failure is not None and self.stopped:
+            raise RecordingFailed(
+                f"{self.file} could not be written: {self._failure.strerror or self._failure}",
+                remedy="free space on the disk, or choose another file; to go on with gaps, say so: --on-failure go-on",
+            )
 
     def __enter__(self) -> Recorder:
         return self
@@ -277,23 +288,10 @@ class Recorder:
             _log.error("%s: samples of %r are not recorded: %s (further ones are only counted)", self.file, topic, why)
 
     def _fail(self, error: OSError, what: str) -> None:
-        """The file could not be written: say so once, and stop the main program if that is wanted."""
+        """The file could not be written: say so once."""
         first, self._failure = self._failure is None, error
-        if not first:
-            return
-        _log.error("%s: %s: %s (further failures are only counted)", self.file, what, error.strerror or error)
-        if self._on_failure == "stop":
-            self._clock.call_at(self._clock.now_ns(), self._stop_program, name="recorder")
-
-    def _stop_program(self) -> None:
-        if self._failure is not None:
-            raise self._failed(self._failure)
-
-    def _failed(self, error: OSError) -> RecordingFailed:
-        return RecordingFailed(
-            f"{self.file} could not be written: {error.strerror or error}",
-            remedy="free space on the disk, or choose another file; to go on with gaps, say so: --on-failure go-on",
-        )
+        if first:
+            _log.error("%s: %s: %s (further failures are only counted)", self.file, what, error.strerror or error)
 
 
 def _status(file: Path) -> os.stat_result | None:

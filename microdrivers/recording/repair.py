@@ -10,12 +10,20 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from microdrivers.recording.header import HEADER_RECORD, PROFILE, REPAIR_RECORD, to_metadata
+from microdrivers.recording.header import (
+    CLOCK_RECORD,
+    HEADER_RECORD,
+    PROFILE,
+    REPAIR_RECORD,
+    ClockMapping,
+    from_metadata,
+    to_metadata,
+)
 from microdrivers.recording.images import IMAGE_SCHEMA
 from microdrivers.recording.mcap_scan import Loss, McapScan, read_definition, records_in
 from microdrivers.recording.mcap_writer import MESSAGE, ChannelKey, LostChunk, McapWriter
 from microdrivers.recording.output import not_writable, refuse_existing, whole_file
-from microdrivers.recording.reader import LIST_MARK, open_scan, read_header
+from microdrivers.recording.reader import LIST_MARK, open_scan, read_clock_record, read_header
 from microdrivers.recording.schemas import FrameInfo, schema_name
 
 
@@ -49,6 +57,7 @@ def repair(file: Path, out: Path) -> RepairReport:
     scan = open_scan(file)
     try:
         header = read_header(scan)
+        read_clock_record(scan)
         refuse_existing(out)
         try:
             with whole_file(out) as part, part.open("wb", buffering=0) as output:
@@ -87,7 +96,8 @@ class _Copy:
         """Copy everything, and end the file."""
         self._writer.add_metadata(HEADER_RECORD, header)
         for record in self._scan.metadata:
-            if record.name != HEADER_RECORD:
+            is_damaged = record.name == CLOCK_RECORD and from_metadata(record.metadata, ClockMapping) is None
+            if record.name != HEADER_RECORD and not is_damaged:
                 self._writer.add_metadata(record.name, record.metadata)
         for attachment in self._scan.attachments:
             self._writer.add_attachment(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, NamedTuple
 
 from microdrivers.core.bus import HISTORY_LENGTH, Bus, Topic
@@ -52,6 +52,7 @@ class Replay:
         leave_out: topics, or patterns, that are not published.
         clock: samples are published at the distances of their times divided by `speed`, on this clock.
         speed: None publishes as fast as possible.
+        admit: is asked, in their order, which samples are to be published; default: all.
 
     Attributes:
         published: number of samples so far. missing: samples that an inbox got and the recording does not hold.
@@ -65,6 +66,7 @@ class Replay:
         leave_out: Collection[str] = ESTIMATES,
         clock: Clock | None = None,
         speed: float | None = None,
+        admit: Callable[[str, Sample], bool] = lambda _topic, _sample: True,
     ) -> None:
         self.published = 0
         self.missing = 0
@@ -76,6 +78,7 @@ class Replay:
         self._recording = recording
         self._clock = clock
         self._speed = speed
+        self._admit = admit
         self._began_ns: tuple[int, int] | None = None
 
     def up_to(self, order: int | None) -> None:
@@ -158,6 +161,8 @@ class Replay:
         return entry
 
     def _publish(self, topic: str, sample: Sample) -> None:
+        if not self._admit(topic, sample):
+            return
         if self._speed is not None and self._clock is not None:
             self._keep_pace(sample, self._clock, self._speed)
         self.published += 1

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from microdrivers.report.number_format import compact, significant, with_uncertainty, without_exponents
-from microdrivers.results.force import PROTOCOLS, ForceResult, ProtocolName, ProtocolResult, VisionCheck
+from microdrivers.results.force import PROTOCOLS, ForceResult, ProtocolName, VisionCheck
 
 FACTOR_95 = 1.96
 K2_UNIT = "10⁻⁶ µN/µm³"
@@ -71,7 +71,7 @@ class ProtocolRow(NamedTuple):
 
 
 class TruthRow(NamedTuple):
-    """One parameter of the best fit beside the simulation's truth."""
+    """One parameter of the best fit beside the simulation's truth; in brackets if the record does not determine it."""
 
     name: str
     value: str
@@ -80,11 +80,15 @@ class TruthRow(NamedTuple):
 
 
 def protocol_rows(result: ForceResult) -> list[ProtocolRow]:
-    """All fits, in the paper's order."""
-    return [_row(result, name, result.protocols[name]) for name in PROTOCOLS if name in result.protocols]
+    """All fits, in the paper's order; with the paper's figures, unless they have nothing to do with any of them."""
+    names = [name for name in PROTOCOLS if name in result.protocols]
+    as_stiff = _AS_STIFF[0] <= result.protocols[result.best].k1_uN_per_um <= _AS_STIFF[1]
+    beside = as_stiff and any(any(PAPER[name]) for name in names)
+    return [_row(result, name, PAPER[name] if beside else ()) for name in names]
 
 
-def _row(result: ForceResult, key: ProtocolName, fit: ProtocolResult) -> ProtocolRow:
+def _row(result: ForceResult, key: ProtocolName, paper: tuple[str, ...]) -> ProtocolRow:
+    fit = result.protocols[key]
     known = fit.identifiable
     weak = tuple(name for name in ("k1", "k2", "b") if not getattr(known, name))
     return ProtocolRow(
@@ -96,7 +100,7 @@ def _row(result: ForceResult, key: ProtocolName, fit: ProtocolResult) -> Protoco
         error=f"{significant(fit.error_percent, 3)} %",
         noise="" if fit.noise_residual_ratio is None else f"{significant(fit.noise_residual_ratio, 2)} ×",
         weak=tuple((name, reason) for name in weak for reason in _foremost(known.reasons.get(name, ""))),
-        paper=PAPER[key] if _AS_STIFF[0] <= result.protocols[result.best].k1_uN_per_um <= _AS_STIFF[1] else (),
+        paper=paper,
         best=key == result.best,
     )
 
@@ -170,40 +174,51 @@ def truth_rows(result: ForceResult) -> list[TruthRow]:
     if truth is None:
         return []
     fit, slip = result.protocols[result.best], result.slip
+    known = fit.identifiable
     rows = [
-        ("k1", fit.k1_uN_per_um, truth.k1_uN_per_um, "µN/µm"),
-        ("k2", _K2_SCALE * fit.k2_uN_per_um3, _K2_SCALE * truth.k2_uN_per_um3, f"× {K2_UNIT}"),
-        ("b", fit.b_uN_s_per_um, truth.b_uN_s_per_um, "µN·s/µm"),
+        ("k1", fit.k1_uN_per_um, truth.k1_uN_per_um, "µN/µm", known.k1),
+        ("k2", _K2_SCALE * fit.k2_uN_per_um3, _K2_SCALE * truth.k2_uN_per_um3, f"× {K2_UNIT}", known.k2),
+        ("b", fit.b_uN_s_per_um, truth.b_uN_s_per_um, "µN·s/µm", known.b),
     ]
-    if slip is not None and truth.slip_offset_um:
+    if slip is not None and truth.slip_offset_um and result.best == "slip_corrected":
         rows += [
-            ("slip offset", slip.offset_um, truth.slip_offset_um, "µm"),
-            ("slip rate", slip.rate_per_s, truth.slip_rate_per_s, "1/s"),
+            ("slip offset", slip.offset_um, truth.slip_offset_um, "µm", slip.identifiable),
+            ("slip rate", slip.rate_per_s, truth.slip_rate_per_s, "1/s", slip.identifiable),
         ]
-    return [
-        TruthRow(name, f"{significant(value, 5)} {unit}", f"{compact(true)} {unit}", _percent(value, true))
-        for name, value, true, unit in rows
-    ]
+    return [_truth_row(*row) for row in rows]
 
 
-def _percent(value: float, truth: float) -> str:
-    return f"{significant(100.0 * (value / truth - 1.0), 2, signed=True)} %" if truth else ""
+def _truth_row(name: str, value: float, true: float, unit: str, known: bool) -> TruthRow:
+    found = f"{significant(value, 5)} {unit}"
+    error = f"{significant(100.0 * (value / true - 1.0), 2, signed=True)} %" if true else ""
+    if not known:
+        found, error = (f"({text})" if text else "" for text in (found, error))
+    return TruthRow(name, found, f"{compact(true)} {unit}", error)
 
 
 def slip_text(result: ForceResult) -> str:
-    """The slip that eq. (26) found, in words; that it is not needed, if the best protocol has none; else empty."""
+    """The slip that eq. (26) found, in words; if the best protocol has none, that and why; empty if none was fitted."""
     slip = result.slip
     if slip is None:
         return ""
+    # That an interval is wide is seen.
+    why = "; ".join(dict.fromkeys(_WIDE if "95 % interval" in each else each for each in slip.reason.split("; ")))
     if result.best != "slip_corrected":
-        return "the best fit does without"
+        does_without = "the best fit does without"
+        return f"{does_without}, though with it the error is less: {why}" if slip_fits_better(result) else does_without
     offset = with_uncertainty(slip.offset_um, _half(slip.offset_sigma_um))
     rate = with_uncertainty(slip.rate_per_s, _half(slip.rate_sigma_per_s))
     offset_text = f"{offset.value}{_plus(offset.plus_minus)} µm"
     rate_text = f"{rate.value}{_plus(rate.plus_minus)} per s"
     if not slip.identifiable:
-        return f"(offset {offset_text}, α = {rate_text}), not to be quoted: {without_exponents(slip.reason)}"
+        return f"(offset {offset_text}, α = {rate_text}), not to be quoted: {without_exponents(why)}"
     return f"offset {offset_text} (paper: 25 µm), α = {rate_text} (not printed)"
+
+
+def slip_fits_better(result: ForceResult) -> bool:
+    """Whether a slip would lessen the error of a best protocol that has none."""
+    best, slipped = result.protocols[result.best], result.protocols.get("slip_corrected")
+    return slipped is not None and result.best != "loading" and slipped.error_percent < best.error_percent
 
 
 def _half(sigma: float | None) -> float | None:

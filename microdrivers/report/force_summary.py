@@ -10,6 +10,7 @@ from microdrivers.report.force_quantities import (
     excluded_text,
     pressed_text,
     protocol_rows,
+    slip_fits_better,
     slip_text,
     truth_rows,
     valid_depth_text,
@@ -43,14 +44,14 @@ def _heading(result: ForceResult) -> list[str]:
     specimen = provenance.settings.get("specimen") or (result.truth.preset if result.truth is not None else "")
     what = f"Force characterisation{f' of {specimen}' if specimen else ''}"
     where = f", {provenance.rig_name}, {setup.sensor}" if provenance.rig_name else ""
-    state = "complete" if result.complete else "INTERRUPTED"
+    state = "complete" if result.complete else "NOT COMPLETE"
     return [what + where, f"{run_kind(provenance).label}, {state}, {created(provenance)}"]
 
 
 def _protocols(result: ForceResult) -> list[str]:
     found = protocol_rows(result)
     heads = ["", "k1 (µN/µm)", f"k2 ({K2_UNIT})", "b (µN·s/µm)", "error"]
-    rows = [heads + ["paper"] * any(row.paper for row in found)]
+    rows = [heads + ["paper"] * bool(found[0].paper)]
     rows += [
         [f"{'*' if row.best else ' '} {row.key}", row.k1.text, row.k2.text, row.b.text, row.error, *row.paper[3:]]
         for row in found
@@ -81,7 +82,7 @@ def _performance(result: ForceResult) -> list[str]:
         ("Valid for", f"{valid_depth_text(result)}; {valid_speed_text(result)}"),
     ]
     slip = slip_text(result)
-    if slip and result.best == "slip_corrected":
+    if slip and (result.best == "slip_corrected" or slip_fits_better(result)):
         rows.append(("Slip", slip))
     if any(quantity.weak for row in protocol_rows(result) for quantity in (row.k1, row.k2, row.b)):
         rows.append(("In brackets", "not to be quoted as properties of the specimen; report.html says why"))
@@ -90,9 +91,8 @@ def _performance(result: ForceResult) -> list[str]:
         rows.append(("Camera alone", camera_text(result.vision_check)))
     if result.largest_speed_um_s is not None:
         force_uN = significant(result.setup.largest_force_uN, 4)
-        rows.append(
-            ("Speed limit", f"{significant(result.largest_speed_um_s, 3)} µm/s keep below {force_uN} µN in that range")
-        )
+        fastest = significant(result.largest_speed_um_s, 3)
+        rows.append(("Speed limit", f"up to {fastest} µm/s the force stays below {force_uN} µN in that range"))
     excluded = excluded_text(result)
     if excluded:
         rows.append(("Not used", f"samples: {excluded}"))

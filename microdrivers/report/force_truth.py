@@ -34,7 +34,7 @@ class ContactTruthCollector:
             "k2": (best.k2_uN_per_um3, specimen.k2_uN_per_um3),
             "b": (best.b_uN_s_per_um, specimen.b_loading_uN_s_per_um),
         }
-        if slip is not None and specimen.slip_um:
+        if slip is not None and specimen.slip_um and result.best == "slip_corrected":
             pairs |= {
                 "slip_offset": (slip.offset_um, specimen.slip_um),
                 "slip_rate": (slip.rate_per_s, specimen.slip_rate_per_s),

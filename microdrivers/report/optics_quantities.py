@@ -133,17 +133,17 @@ def settling(result: OpticsResult) -> list[Settling]:
     change = result.zoom_change
     if change is None:
         return []
-    period_s = frame_period_s(result)
+    start, end = change.first_frame, change.last_moving_frame + 1
     return [
         Settling(
             "a priori",
-            _iterations(change.iterations_to_0p1_px, period_s),
-            _iterations(change.iterations_to_0p1_px_from_end, period_s),
+            _iterations(result, start, change.iterations_to_0p1_px),
+            _iterations(result, end, change.iterations_to_0p1_px_from_end),
         ),
         Settling(
             "a posteriori",
-            _iterations(change.posterior_iterations_to_0p1_px, period_s),
-            _iterations(change.posterior_iterations_to_0p1_px_from_end, period_s),
+            _iterations(result, start, change.posterior_iterations_to_0p1_px),
+            _iterations(result, end, change.posterior_iterations_to_0p1_px_from_end),
         ),
     ]
 
@@ -256,8 +256,12 @@ def _view(result: OpticsResult) -> Quantity:
     )  # fmt: skip
 
 
-def _iterations(count: int | None, period_s: float | None) -> str:
+def _iterations(result: OpticsResult, first: int, count: int | None) -> str:
+    """So many, and how long they took; a frame that was lost meanwhile takes its time all the same."""
     if count is None:
         return "not reached"
     text = f"{count} iteration" if count == 1 else f"{count} iterations"
-    return text if period_s is None else f"{text} ({fixed(count * period_s, 2)} s)"
+    times_s, period_s = result.traces.time_s, frame_period_s(result)
+    if period_s is None:
+        return text
+    return f"{text} ({fixed(times_s[first + count - 1] - times_s[first] + period_s, 2)} s)"

@@ -38,7 +38,7 @@ def _heading(result: OpticsResult) -> list[str]:
     provenance = result.provenance
     # Of an image sequence no rig is known.
     what = ", ".join(filter(None, (provenance.rig_name, result.valid_for.camera, zoom_name(result.zoom))))
-    state = "complete" if result.complete else "INTERRUPTED"
+    state = "complete" if result.complete else "NOT COMPLETE"
     return [f"Optical calibration of {what}", f"{run_kind(provenance).label}, {state}, {created(provenance)}"]
 
 

@@ -117,7 +117,9 @@ class Misfit(Record):
 class VisionCheck(Record):
     """A fresh indentation of the same specimen with the force from the camera alone, against the sensor.
 
-    All its frames count, reversals included. `largest_error_s` and `deepest_s` are instants of `ForceTraces.check_*`.
+    All its frames count, reversals included. `left_over_uN` is the largest force that the camera still told where the
+    specimen rested on its way back, flagged MAY_BE_RELEASED, and the sensor felt less than half of it; None if nowhere.
+    `largest_error_s` and `deepest_s` are instants of `ForceTraces.check_*`.
     """
 
     error_percent: float
@@ -126,6 +128,7 @@ class VisionCheck(Record):
     outside_range: int
     largest_error_s: float | None = None
     deepest_s: float | None = None
+    left_over_uN: float | None = None
 
 
 class ForceTraces(Record):
@@ -165,11 +168,12 @@ class Setup(Record):
 
     `scale_source`: the probe's own travel, an optical calibration, or a recording that states µm.
     `image_drift_um_s`: of the picture along the probing direction, as a probe that has come back shows it; taken off.
-    `speed_um_s`, `unloading_speed_um_s`: of the tool; of a recording, the contact point's mean speed in and out.
+    `speed_um_s`, `unloading_speed_um_s`: of the tool; of a recording, the contact point's mean speed in and out. The
+    latter, and `fastest_unloading_um_s`, None where the way back could not be fitted.
     `pressed_um`: how far the contact point was pressed in from the undeformed surface. `deepest_um`: how deep the best
     model is valid, in its own compression x: of a specimen that slipped, x*, which is less by what the holder gave way.
     `fastest_um_s`, `fastest_unloading_um_s`: how fast the best model is valid, in and out.
-    `largest_force_uN`: within the sensor's range; samples at the end of it are not counted.
+    `largest_force_uN`: the sensor's zero taken off, and within its range; samples at the end of it are not counted.
     """
 
     sensor: str

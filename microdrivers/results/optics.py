@@ -114,7 +114,8 @@ class OpticsResult(Record):
         prediction_error_px: a priori, one a frame. posterior_error_px: a posteriori.
         magnification_trace: one a frame.
         zoom_change: None if the zoom did not change.
-        lost_frames: frames in which the target was not found. unmatched_frames: frames without a pose around them.
+        lost_frames: frames in which the target was not found, or that a replayed recording lacks.
+        unmatched_frames: frames without a pose around them.
     """
 
     schema_version: Literal[1] = 1

@@ -78,6 +78,10 @@ class Safety:
         """By sensor, why its guard has tripped, of those that have and are not over it."""
         return {sensor: guard.tripped for sensor, guard in self.guards.items() if guard.tripped}
 
+    def took_away(self, stage: str) -> bool:
+        """Whether the last that moved a stage was a guard, which has taken its tool away."""
+        return any(guard.retraction.took_away for guard in self._guards_of(stage))
+
     def begin(self, stage: str) -> None:
         """Have the forces come that guard a stage, as its first move does. Nothing moves.
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
 from microdrivers.core.errors import ConfigError
 from microdrivers.devices.drivers import DeviceSettings
 from microdrivers.devices.fine_stage import FineStage
+from microdrivers.devices.fine_stage_settings import ToolCarrierSettings
 from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.devices.force_sensor_settings import ForceSensorSettings
 from microdrivers.devices.stage import Stage
-from microdrivers.rig.safety_section import NONE, ForceGuardSettings
+from microdrivers.rig.safety_section import NONE, UNSTATED, ForceGuardSettings, SafetySection
 from microdrivers.rig.sections import DeviceEntry, RigFile
 from microdrivers.rig.yaml_file import Document, Location
 
@@ -32,11 +34,19 @@ def check_safety(rig: RigFile, devices: Mapping[str, DeviceEntry], document: Doc
     return errors
 
 
+def unguarded(safety: SafetySection, devices: Mapping[str, DeviceEntry]) -> dict[str, str]:
+    """The force sensors that no guard watches although a stage carries them, each with its stage."""
+    guarded = {guard.sensor for guard in safety.force_guards}
+    carriers = {name: _carrier(entry) for name, entry in devices.items() if name not in guarded}
+    return {
+        name: carrier
+        for name, carrier in carriers.items()
+        if carrier is not None and carrier in devices and issubclass(devices[carrier].driver.kind, Stage)
+    }
+
+
 def _must_be_stated(devices: Mapping[str, DeviceEntry], document: Document) -> list[ConfigError]:
-    for name, entry in devices.items():
-        carrier = _carrier(entry)
-        if carrier is None or carrier not in devices or not issubclass(devices[carrier].driver.kind, Stage):
-            continue
+    for name, carrier in unguarded(UNSTATED, devices).items():
         guard = f"{{sensor: {name}, stage: {carrier}, max_force_uN: …}}"
         return [
             document.error(
@@ -73,7 +83,15 @@ def _check_guard(
             f"{guard.sensor}",
         )
     yield from _check_figures(guard, devices[guard.sensor].settings, document, where)
-    if getattr(devices[guard.stage].settings, "retract_um", None) is None:
+    stage = devices[guard.stage].settings
+    largest_um_s = stage.largest_speed_um_s if isinstance(stage, ToolCarrierSettings) else math.inf
+    if guard.max_speed_um_s is not None and guard.max_speed_um_s > largest_um_s:
+        yield document.error(
+            f"{guard.max_speed_um_s:g} µm/s forbid nothing: {guard.stage} moves at {largest_um_s:g} µm/s at most",
+            (*where, "max_speed_um_s"),
+            remedy="state less, so that the tool stops soon enough, or leave it out",
+        )
+    if getattr(stage, "retract_um", None) is None:
         yield document.error(
             f"{guard.stage} has no way to take the tool away from what it presses on", ("devices", guard.stage),
             remedy="state retract_um: [x, y, z] of this stage in its own axes, the way that leads away from the sample",

@@ -44,8 +44,14 @@ class Retraction:
         self._timer: Timer | None = None
         self._move: Move[FineStageSample] | None = None
         self._patience_ns = 0
+        self._took_away_ns: int | None = None
         self._closed = False
         self.active = False
+
+    @property
+    def took_away(self) -> bool:
+        """Whether this has taken the tool away, and nothing has been commanded since."""
+        return self._took_away_ns is not None and self._took_away_ns == self._stage().commanded_ns
 
     def begin(self) -> None:
         """Start it, from any thread or callback; nothing is awaited."""
@@ -110,6 +116,7 @@ class Retraction:
         if pose is not None:
             where = ", ".join(f"{axis} {position:.2f} µm" for axis, position in pose.position.items())
             share = stage.retraction_share
+            self._took_away_ns = stage.commanded_ns if share > 0.0 else None
             part = "" if share == 1.0 else f" by {100 * share:.0f} % of retract_um, for no more is free"
             self._end(f"the tool was taken away{part}, to {where}", succeeded=share > 0.0)
 

@@ -17,6 +17,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 _AS_JSON = pydantic.TypeAdapter(Any, config=pydantic.ConfigDict(ser_json_inf_nan="constants"))
 _CORRECT = "correct the value"
 _LONGEST_SHOWN = 60
+_CLOSE = 0.7
+"""Of two spellings, as difflib measures: a slip of the pen, and not another word."""
 
 _MAPPING, _NUMBER, _WHOLE_NUMBER = "a mapping of keys to values", "a number", "a whole number"
 _NEEDED = {
@@ -59,10 +61,15 @@ def validate(
 def suggest(name: str, known: Iterable[str]) -> str:
     """What to do about a name that is none of the known ones."""
     known = list(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    if close:
-        return f"did you mean {close[0]!r}?"
-    return f"name one of {', '.join(known)}" if known else "leave it out: there is none that could be named"
+    return _meant(name, known) or (
+        f"name one of {', '.join(known)}" if known else "leave it out: there is none that could be named"
+    )
+
+
+def _meant(written: Any, known: Iterable[str]) -> str:
+    """The question after the known word that is nearly what was written; empty if none is."""
+    close = difflib.get_close_matches(str(written), list(known), n=1, cutoff=_CLOSE)
+    return f"did you mean {close[0]!r}?" if close else ""
 
 
 def _by_place(details: Iterable[Any], data: Any) -> list[tuple[Location, list[Any]]]:
@@ -167,12 +174,11 @@ def _wrong_length(value: Any, needed: str, document: Document, where: Location) 
 def _no_choice(value: Any, expected: str, document: Document, where: Location) -> ConfigError:
     if value is None:
         return document.error(f"nothing stands here; {expected} is needed", where, remedy="add a value")
-    close = difflib.get_close_matches(str(value), re.findall(r"'([^']*)'", expected), n=1)
     number = _number_meant(value)
     if number in re.findall(r"[-\d]+", expected):
         remedy = f"write the bare number: {number}"
     else:
-        remedy = f"did you mean {close[0]!r}?" if close else _CORRECT
+        remedy = _meant(value, re.findall(r"'([^']*)'", expected)) or _CORRECT
     return document.error(f"{value!r} is not possible here: it must be {expected}", where, remedy=remedy)
 
 
@@ -201,8 +207,7 @@ def _known_keys(model: type[pydantic.BaseModel], loc: Sequence[str | int]) -> st
         variants = [each for each in models if any(part in get_args(f.annotation) for f in each.model_fields.values())]
         models = [inner for field in fields for inner in _models_in(field)] if fields else variants or models
     known = list(dict.fromkeys(key for each in models for key in each.model_fields))
-    close = difflib.get_close_matches(str(loc[-1]), known, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"known keys here: {', '.join(known)}"
+    return _meant(loc[-1], known) or f"known keys here: {', '.join(known)}"
 
 
 def _models_in(annotation: Any) -> Iterator[type[pydantic.BaseModel]]:

@@ -19,19 +19,25 @@ class PastRun(NamedTuple):
     Attributes:
         ended_by: what ended the recorded run early; empty if nothing did.
         flaws: what the recording lacks, or has wrong.
+        lost_frames: how many frames its estimator had and the recording lacks, where that is counted.
     """
 
     ended_by: str = ""
     flaws: tuple[str, ...] = ()
+    lost_frames: int = 0
 
     def notes(self) -> list[str]:
         """The flaws as a result's notes."""
         told = [f"The result is from a recording with a flaw: {flaw}." for flaw in self.flaws[:_MOST_FLAWS]]
         more = len(self.flaws) - len(told)
-        return [*told, f"The recording has {more} more flaws; `microdrivers info` lists them."] if more else told
+        if not more:
+            return told
+        return [*told, f"The recording has {more} more flaw{'s' * (more > 1)}; `microdrivers info` lists all of them."]
 
 
-def past_run(recording: Recording, done: Sequence[Note], *, missing: int, broken_off: str) -> PastRun:
+def past_run(
+    recording: Recording, done: Sequence[Note], *, missing: int, broken_off: str, lost_frames: int = 0
+) -> PastRun:
     """What a recording tells of its run.
 
     Args:
@@ -39,7 +45,10 @@ def past_run(recording: Recording, done: Sequence[Note], *, missing: int, broken
         done: the routine's notes of its end.
         missing: how many samples its estimators had and it does not hold.
         broken_off: what else says that the run ended early, where no note of the end is found; empty: nothing does.
+        lost_frames: how many of `missing` are frames, where that is counted.
     """
     ended_by = str(done[-1].content["ended_by"]) if done else broken_off
-    lacks = [f"it lacks {missing} samples that the estimators had"] if missing else []
-    return PastRun(ended_by, (*recording.flaws, *lacks))
+    # First, as `info` does not tell it: what is behind the last flaw that has room is looked up there.
+    frames = f", among them {lost_frames} frame{'s' * (lost_frames > 1)} of the experiment" if lost_frames else ""
+    lacks = [f"it lacks {missing} sample{'s' * (missing > 1)} that the estimators had{frames}"] if missing else []
+    return PastRun(ended_by, (*lacks, *recording.flaws), lost_frames)

@@ -12,6 +12,7 @@ from microdrivers.cli.run_output import RunOutput
 from microdrivers.configs import shipped_rig
 from microdrivers.core.errors import MoveCancelled
 from microdrivers.estimators.force.identify import IdentificationSettings
+from microdrivers.report import force_report
 from microdrivers.results.force import read_force_result
 from tests.routines.indentation_source import K1, MadeUpSource
 
@@ -104,6 +105,19 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     assert "to analyse it" not in told
     assert source.whereabouts in told
     assert not (tmp_path / "result.json").exists()
+
+
+def test_an_interruption_of_the_report_names_what_is_there(run, tmp_path, monkeypatch):
+    def interrupted(*_arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(force_report, "write_force_report", interrupted)
+    result = run("calibrate", "force", "--csv", REAL, "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    assert "/out/ holds record.csv, result.json, specimen.yaml and lacks report.html" in result.stderr
+    assert "choose another --out folder" in result.stderr
+    read_force_result(tmp_path / "out" / "result.json")
+    assert len(list((tmp_path / "out").iterdir())) == 3
 
 
 def _in_mN(rows):

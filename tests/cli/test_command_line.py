@@ -49,6 +49,7 @@ def test_help_imports_nothing_heavy():
 
 
 def test_check_says_what_is_there(run):
+    assert "no force guard watches gripper_force" in run("check", shipped_rig()).stdout
     result = run("check", shipped_rig("microscope"))
     assert result.exit_code == 0
     assert "sample_stage" in result.output

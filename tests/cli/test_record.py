@@ -115,6 +115,11 @@ def test_record_needs_an_end_where_time_flies_and_a_file_that_is_new(run, tmp_pa
 def test_repair_tells_what_was_kept_and_lost(run, tmp_path):
     run("record", shipped_rig("microscope"), "--fake", "--for", 0.3, "--out", "a.mcap")
     whole = (tmp_path / "a.mcap").read_bytes()
+    with Recording(tmp_path / "a.mcap") as recording:
+        between = recording._scan.chunks[2].offset
+    (tmp_path / "c.mcap").write_bytes(whole[:between])
+    shown = run("recording", "repair", "c.mcap").stdout
+    assert "lost:\n  the recording was not ended" in shown
     (tmp_path / "a.mcap").write_bytes(whole[: len(whole) // 2])
     result = run("recording", "repair", "a.mcap")
     assert result.exit_code == 0, result.output

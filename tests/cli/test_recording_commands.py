@@ -97,9 +97,13 @@ def test_info_tells_gaps_and_times_that_run_backwards(run, tmp_path):
     with Recorder(tmp_path / "a.mcap", bus=bus, clock=SimulatedClock(), header=RecordingHeader(source="fake")):
         for seq, t_ns in ((0, 1000), (1, 3000), (4, 2000)):
             bus.topic("f", ForceSample).publish(ForceSample(t_ns=t_ns, device="f", seq=seq, force_uN=0.0, raw_uN=0.0))
+        for seq in range(2):
+            bus.topic("g", ForceSample).publish(ForceSample(t_ns=seq, device="g", seq=seq, force_uN=0.0, raw_uN=0.0))
     topic = json.loads(run("info", "a.mcap", "--json").stdout)["topics"]["f"]
     assert (topic["missing"], topic["unsorted"]) == (2, 1)
-    assert "3 of 3 samples" in run("replay", "a.mcap", "--speed", 100).stdout
+    rates = [line.split()[3] for line in run("info", "a.mcap").stdout.splitlines() if "ForceSample" in line]
+    assert rates == ["1e+06", "–"]
+    assert "5 of 5 samples" in run("replay", "a.mcap", "--speed", 100).stdout
     assert run("export", "a.mcap", "--to", "csv").exit_code == 0
     assert "no frames to show" in run("info", "a.mcap", "--contact-sheet", "sheet.png").stderr
     assert "no frames to export" in run("export", "a.mcap", "--to", "video").stderr
@@ -147,9 +151,10 @@ def test_options_that_drive_an_experiment_are_refused_where_there_is_none(run, t
     assert result.exit_code == 1
     assert f"{option} replaces the rig" in result.stderr
     assert "leave out --" in result.stderr
-    assert value[0].replace("no-", "").replace("--in-motion", "--settled") in result.stderr.splitlines()[-1]
+    assert f"leave out {value[0]}; what can be tried" in result.stderr.splitlines()[-1]
     assert not (tmp_path / "run").exists()
     others = "--frames, --forgetting" if kind == "optics" else "--leave-out, --protocol"
+    others = f"--no-check, {others}" if (kind, option) == ("force", "--replay") else others
     assert f"what can be tried on old data: {others}" in result.stderr
 
 
@@ -182,6 +187,12 @@ def test_old_data_has_no_more_frames_than_it_has(run, run_file):
     assert (result.exit_code, "frames of the experiment, not 400" in result.stderr) == (1, True)
     for option, value in (("--forgetting", "nan"), ("--forgetting", "0"), ("--drift-um-s", "inf")):
         assert run("calibrate", "optics", "--replay", run_file, option, value).exit_code == 2
+
+
+def test_a_calibration_that_is_none_of_the_last_zoom_is_no_success(run):
+    result = run("calibrate", "optics", "--frames", 60, "--flush-frames", 100, "--no-record", "--out", "run")
+    assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (1, True), result.output
+    assert "The run ended" in result.stdout
 
 
 def test_a_replay_never_writes_over_a_result(run, run_file, force_recording, tmp_path):
@@ -288,7 +299,7 @@ def test_export_goes_beside_the_recording(run, run_file, tmp_path):
 def test_analyse(run, run_file, tmp_path):
     result = run("analyse", ".", "--out", "t.csv")
     assert result.exit_code == 0, result.output
-    assert "1 recordings, 0 with errors" in result.stdout
+    assert ": 1 recording, 0 with errors" in result.stdout
     assert "never written over" in run("analyse", ".", "--out", "t.csv").stderr
 
 
@@ -329,6 +340,7 @@ def test_a_result_from_a_damaged_recording_says_so(run, optics_recording, force_
     run("analyse", "run.repaired.mcap", "--out", "t.csv")
     [row] = read_table(tmp_path / "t.csv")
     assert row["losses"] == "1"
+    assert "1 recording, 0 with errors, 1 with losses" in run("analyse", "run.mcap", "--out", "t2.csv").stdout
 
 
 def test_an_interrupted_characterisation_stays_one_when_it_is_replayed(run, force_recording, tmp_path):
@@ -369,7 +381,7 @@ def test_analyse_succeeds_if_some_can_be_analysed(run, run_file, tmp_path):
 
 def test_analyse_waits_for_no_pipe(run, run_file, tmp_path):
     os.mkfifo(tmp_path / "pipe.mcap")
-    assert "1 recordings, 0 with errors" in run("analyse", ".", "--out", "t.csv").stdout
+    assert ": 1 recording, 0 with errors" in run("analyse", ".", "--out", "t.csv").stdout
     result = run("analyse", "pipe.mcap", "--out", "u.csv")
     assert (result.exit_code, "neither a file nor a folder" in result.stderr) == (1, True)
 

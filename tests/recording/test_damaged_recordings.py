@@ -104,7 +104,8 @@ def test_an_interrupted_recording_is_read_up_to_the_tear(stage, same, tmp_path):
     assert not recording.complete
     assert 500 < len(found) < len(stage.published)
     assert same(found[-1][1], stage.published[len(found) - 1][1])
-    assert [str(loss) for loss in recording.losses] == ["the recording was not ended: its last 0.1 s may be missing"]
+    told = "the recording was not ended: at most its last 0.1 s are missing if its program was killed, more if"
+    assert [str(loss).removeprefix(told) for loss in recording.losses] == [" its disk was full"]
     report = repair(stage.file, tmp_path / "whole.mcap")
     assert (report.lost_bytes, report.messages["force"]) == (0, recording.topics["force"].count)
     assert stage.file.read_bytes() == torn
@@ -153,6 +154,33 @@ def test_damaged_times_of_a_chunk_are_told_and_mended_by_a_repair(recorded, same
     again = Recording(report.out)
     assert again.losses + again.check_indexes() == []
     assert len(list(again.samples())) == len(recorded.published)
+
+
+def test_a_damaged_copy_of_the_header_is_told(recorded, tmp_path):
+    data = recorded.file.read_bytes()
+    place = data.rindex(b"created_utc") + 16
+    (tmp_path / "a.mcap").write_bytes(data[:place] + b"3" + data[place + 1 :])
+    told = [str(loss) for loss in Recording(tmp_path / "a.mcap").losses]
+    assert told == ["one of the recording's headers is damaged: another one is intact"]
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_damaged_record_of_the_clock_is_told(recorded, tmp_path, at_end):
+    data = recorded.file.read_bytes()
+    key = b"offset_ns"
+    place = (data.rindex if at_end else data.index)(key) + len(key) + 4
+    file = tmp_path / "damaged.mcap"
+    file.write_bytes(data[:place] + b"7" + data[place + 1 :])
+    damaged = Recording(file)
+    assert [str(loss) for loss in damaged.losses] == [
+        f"the recording's clock record{' of its end' if at_end else ''} is damaged: another one is intact"
+    ]
+    assert (damaged.clock.end_offset_ns is None) == at_end
+    report = repair(file, tmp_path / "whole.mcap")
+    assert report.losses == damaged.losses
+    repaired = Recording(report.out)
+    assert repaired.clock == damaged.clock
+    assert [str(loss) for loss in repaired.losses] == [f"lost before the repair: {damaged.losses[0]}"]
 
 
 def test_a_channel_whose_definition_is_damaged_is_known_from_the_summary(recorded, tmp_path):

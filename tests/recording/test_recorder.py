@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from microdrivers.core.clock import SystemClock
+from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import ForceSample, Frame, Sample, WireTraffic
 from microdrivers.recording import recorder as recorder_module
@@ -197,12 +197,20 @@ def test_a_full_disk_is_counted_said_once_and_left_behind_when_there_is_space(st
     assert all(same(sample, stage.published[sample.seq][1]) for topic, sample in found if topic == "force")
 
 
-def test_a_full_disk_stops_the_program_if_that_is_wanted(stage, full_disk):
+@pytest.mark.parametrize("clock", [SimulatedClock, SystemClock])
+def test_a_full_disk_asks_the_program_to_stop_if_that_is_wanted_and_throws_nothing_at_it(stage, full_disk, clock):
+    stage.clock = clock()
     recorder = stage.recorder(on_failure="stop")
+    before = recorder.stopped
+    for index in range(5000):
+        stage.force(index)
+    for _ in range(3):
+        stage.clock.sleep(0.1)
+    after = recorder.stopped
     with pytest.raises(RecordingFailed, match="No space left"):
-        stage.run(seconds=2)
-    with pytest.raises(RecordingFailed):
         recorder.close()
+    stage.clock.close()
+    assert (before, after) == (False, True)
     assert len(read(stage.file)) > 100
 
 

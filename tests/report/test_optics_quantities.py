@@ -115,6 +115,15 @@ def test_settling_counts_and_seconds(make_result):
     assert settling(make_result(zoom_change=False)) == []
 
 
+def test_a_lost_frame_takes_its_time_until_the_error_settles(make_result):
+    result = make_result()
+    change = result.zoom_change.model_copy(update={"iterations_to_0p1_px": 7})
+    times_s = [time_s + (index > change.first_frame + 3) / 30 for index, time_s in enumerate(result.traces.time_s)]
+    traces = result.traces.model_copy(update={"time_s": times_s})
+    rows = settling(result.model_copy(update={"zoom_change": change, "traces": traces}))
+    assert rows[0].from_start == "7 iterations (0.27 s)"
+
+
 def test_settled_frames(make_result):
     result = make_result()
     change = result.zoom_change

@@ -27,7 +27,7 @@ def test_columns_line_up(make_result):
 def test_no_truth_columns_without_truth(make_result):
     text = optics_summary(make_result(with_truth=False, complete=False, provenance={"fake": False, "clock": "system"}))
     assert "truth" not in text
-    assert "real hardware, INTERRUPTED" in text
+    assert "real hardware, NOT COMPLETE" in text
 
 
 @pytest.mark.parametrize("notes", [0, 1, 60])

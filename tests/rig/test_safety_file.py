@@ -105,6 +105,7 @@ MISTAKES = {
         GUARD, f"{GUARD}\n    - {PROBE_GUARD}",
         "'probe_force' stands here twice", "keep one",
     ),
+    "a speed that it never has": (GUARD, "max_speed_um_s: 5000", "probe_stage moves at 1000 µm/s", "leave it out"),
     "a zero beyond the limit": (GUARD, "zero_within_uN: 1600", "hide the whole limit", "less than"),
     "an empty list": (f"  keep_out:\n{BOX}", f"  keep_out: []\n#{BOX}", "a list is needed here", "write none"),
     "half a section": ("  keep_out:", "  keep_uot:", "unknown key", "did you mean 'keep_out'"),

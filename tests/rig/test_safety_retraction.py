@@ -43,6 +43,16 @@ def test_what_is_felt_before_a_retraction_has_been_commanded_does_not_end_it(gua
     assert guarded.true_x_um() == pytest.approx(AT_LIMIT_UM + RETRACT_UM, abs=2.0)
 
 
+def test_that_it_has_taken_the_tool_away_holds_until_the_next_move(guarded):
+    assert not guarded.rig.safety.took_away(guarded.stage.name)
+    press_too_hard(guarded)
+    assert not guarded.rig.safety.took_away(guarded.stage.name)
+    guarded.clock.sleep(1.0)
+    assert guarded.rig.safety.took_away(guarded.stage.name)
+    guarded.stage.move_to(x_um=0.0)
+    assert not guarded.rig.safety.took_away(guarded.stage.name)
+
+
 def test_a_retraction_in_the_middle_of_a_fast_move_may_press_harder_until_that_has_braked(guarded):
     guarded.stage.move_to(x_um=AT_LIMIT_UM + 40.0)
     guarded.stage.start_move_to(x_um=AT_LIMIT_UM - 200.0, speed_um_s=600.0)

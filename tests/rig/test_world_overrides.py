@@ -44,6 +44,13 @@ def test_what_is_wrong_with_them_is_not_blamed_on_the_file(tmp_path):
     assert caught.value.file == str(world)
 
 
+def test_another_word_is_no_slip_of_the_pen():
+    for written, remedy in (("singel", "did you mean 'single'?"), ("nonsense", "correct the value")):
+        with pytest.raises(ConfigError) as caught:
+            build_rig(shipped_rig(), fake=True, world_overrides={"specimen": {"preset": written}})
+        assert caught.value.remedy == remedy
+
+
 def test_they_need_a_simulation_of_their_own(tmp_path):
     with pytest.raises(ConfigError, match="wire_replay takes the place"):
         build_rig(shipped_rig(), wire_replay=tmp_path / "log.jsonl", world_overrides={"specimen": {}})

@@ -10,12 +10,15 @@ import pytest
 
 from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import SimulatedClock, utc_now
+from microdrivers.core.contact_samples import SpecimenEstimate, VisionForceSample
 from microdrivers.report.truth import OpticsTruthCollector
 from microdrivers.results.optics import OpticsResult
 from microdrivers.rig import Rig, build_rig
+from microdrivers.routines.force import Characterisation
 from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsRun, calibrate_optics
 from microdrivers.routines.optics.calibration import build_result
 from microdrivers.routines.provenance import describe_run
+from tests.routines.indentation_source import MadeUpSource, result_of
 
 
 @dataclass
@@ -64,3 +67,14 @@ def calibrate():
         return Calibration(run, result, rig, truth, judge)
 
     return call
+
+
+@pytest.fixture(scope="session")
+def characterised():
+    """A characterisation of a made-up specimen: source, run, result, and what was published on the way."""
+    source = MadeUpSource()
+    published: dict[str, list[Any]] = {"specimen": [], "force": []}
+    source.bus.topic("estimate/specimen", SpecimenEstimate).subscribe(published["specimen"].append)
+    source.bus.topic("estimate/force", VisionForceSample).subscribe(published["force"].append)
+    run = Characterisation(source, keep_samples=True).run()
+    return source, run, result_of(run), published

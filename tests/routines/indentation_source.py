@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import math
+import pathlib
 
 import numpy as np
 
 from microdrivers.core.bus import Bus
-from microdrivers.core.clock import SimulatedClock
+from microdrivers.core.clock import SimulatedClock, utc_now
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.samples import ForceSample
+from microdrivers.routines.force import build_result
 from microdrivers.routines.force.source import IndentationNames, IndentationSetup, Rests
 from microdrivers.routines.past_run import PastRun
+from microdrivers.routines.provenance import describe_run
 
+REAL = pathlib.Path(__file__).parents[1] / "data" / "force" / "chiaro_aebp1_30hz.csv"
 K1, K2, B = 3.0, 2e-4, 20.0
 SPEED_UM_S, DEPTH_UM, PERIOD_NS = 5.0, 60.0, 33_333_333
+
+
+def result_of(run, **known):
+    """Its result, as `calibrate force` makes it."""
+    known = {"source": "made up", "clock": "simulated"} | known
+    return build_result(run, describe_run(known, command="calibrate force", now=utc_now()))
 
 
 class MadeUpSource:

@@ -2,46 +2,26 @@
 
 import contextlib
 import json
-import pathlib
 import re
 
 import numpy as np
 import pytest
 
-from microdrivers.core.clock import utc_now
-from microdrivers.core.contact_samples import SpecimenEstimate, VisionForceSample
 from microdrivers.core.errors import ConfigError, DataError, LinkLost, SaturatedData
 from microdrivers.core.samples import RoutineNote
 from microdrivers.estimators.force.identify import identify
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.recording.indentation_table import IndentationTable
-from microdrivers.report.force_quantities import camera_text, slip_text
+from microdrivers.report.force_quantities import camera_text
 from microdrivers.report.force_report import force_report_html
 from microdrivers.report.force_summary import force_summary
-from microdrivers.report.number_format import significant, without_exponents
+from microdrivers.report.number_format import significant
 from microdrivers.results.force import read_force_result
 from microdrivers.results.specimen import read_specimen
-from microdrivers.routines.force import Characterisation, IndentationPlayback, build_result
-from microdrivers.routines.provenance import describe_run
+from microdrivers.routines.force import Characterisation, IndentationPlayback
+from microdrivers.routines.progress import SilentProgress
 from tests.estimators.force.indentations import recorded
-from tests.routines.indentation_source import K1, K2, B, MadeUpSource
-
-REAL = pathlib.Path(__file__).parents[1] / "data" / "force" / "chiaro_aebp1_30hz.csv"
-
-
-def result_of(run, **known):
-    known = {"source": "made up", "clock": "simulated"} | known
-    return build_result(run, describe_run(known, command="calibrate force", now=utc_now()))
-
-
-@pytest.fixture(scope="module")
-def characterised():
-    source = MadeUpSource()
-    published = {"specimen": [], "force": []}
-    source.bus.topic("estimate/specimen", SpecimenEstimate).subscribe(published["specimen"].append)
-    source.bus.topic("estimate/force", VisionForceSample).subscribe(published["force"].append)
-    run = Characterisation(source, keep_samples=True).run()
-    return source, run, result_of(run), published
+from tests.routines.indentation_source import K1, K2, REAL, B, MadeUpSource, result_of
 
 
 def test_the_specimen_is_found_again(characterised):
@@ -150,45 +130,6 @@ def test_a_specimen_file_without_what_it_needs_is_refused(characterised, tmp_pat
         read_specimen(file)
 
 
-def test_page_and_summary_tell_every_protocol(characterised):
-    _, _, result, _ = characterised
-    page, summary = force_report_html(result), force_summary(result)
-    for name in result.protocols:
-        assert name in page
-        assert name in summary
-    assert page.count("<svg") == 4
-    assert "<script" not in page
-    assert max(len(line) for line in summary.splitlines()) <= 120
-
-
-def test_a_model_that_does_not_fit_is_said_beside_its_numbers(characterised):
-    _, _, result, _ = characterised
-    (note,) = [note for note in result.notes if note.startswith("The model does not explain the record as fitted by")]
-    assert "unloading_springs (" in note
-    assert "× noise" in note
-    assert "single" not in note
-    summary = force_summary(result)
-    assert "In brackets" in summary
-    (row,) = [line for line in summary.splitlines() if line.startswith("  unloading_springs")]
-    assert row.count("(") == 3
-
-
-def test_a_press_without_a_guard_is_told(characterised):
-    _, run, result, _ = characterised
-    assert not any("No force guard" in note for note in result.notes)
-    unguarded = result_of(run._replace(setup=run.setup._replace(guarded=False)))
-    assert any(note.startswith("No force guard watched over the indentation") for note in unguarded.notes)
-
-
-def test_a_slip_that_is_not_identifiable_is_not_quoted(characterised):
-    _, _, result, _ = characterised
-    assert not result.slip.identifiable
-    assert result.slip.reason
-    shown = slip_text(result.model_copy(update={"best": "slip_corrected"}))
-    assert shown.startswith("(offset ")
-    assert f"not to be quoted: {without_exponents(result.slip.reason)}" in shown
-
-
 def test_the_same_samples_give_the_same_bits():
     first, second = (Characterisation(MadeUpSource(seed=4)).run(check=False) for _ in range(2))
     assert first.first.estimates == second.first.estimates
@@ -231,6 +172,29 @@ def test_an_interruption_before_anything_touched_is_told():
     with pytest.raises(DataError):
         Characterisation(source).run()
     assert source.finished == 1
+
+
+@pytest.mark.parametrize(("frames", "told"), [(60, None), (101, None), (200, 3.0)])
+def test_a_fresh_indentation_that_is_broken_off_tells_of_the_camera_only_what_it_saw(frames, told):
+    """Contact is in frame 90, the reversal in frame 450."""
+    source = MadeUpSource(error=KeyboardInterrupt())
+
+    class BreaksOffTheFresh(SilentProgress):
+        def step(self, text):
+            if text.startswith("a fresh indentation"):
+                source._broken_off_at = frames
+
+    result = result_of(Characterisation(source).run(BreaksOffTheFresh()))
+    assert not result.complete
+    said = [note for note in result.notes if "hardly begun to press" in note]
+    if told is None:
+        assert result.vision_check is None
+        assert result.vision_force_error_percent is None
+        assert said
+    else:
+        assert result.vision_force_error_percent < told
+        assert result.vision_check.deepest_s is None  # no reversal yet
+        assert not said
 
 
 def test_the_drift_of_the_picture_is_taken_off():
@@ -311,18 +275,3 @@ def test_a_real_indentation_is_fitted_as_well_as_it_can_be():
     assert result.setup.speed_um_s == pytest.approx(5.9, abs=0.1)
     assert result.setup.fastest_um_s == pytest.approx(7.0, abs=0.1)
     assert result.setup.fastest_unloading_um_s == pytest.approx(99.0, abs=2.0)
-
-
-def test_the_page_of_what_is_no_embryo_is_short_and_without_the_papers_figures():
-    run = Characterisation(IndentationPlayback(IndentationTable(REAL))).run()
-    result = result_of(run, clock="recorded")
-    page, summary = force_report_html(result), force_summary(result)
-    text = re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
-    reasons = re.findall(r"<li>(.*– .*)</li>", text)
-    assert 3 <= len(reasons) <= 5
-    assert max(map(len, reasons)) < 120
-    assert not re.search(r"\de-\d", text)
-    assert not re.search(r"\de-\d", summary)
-    assert "paper 4.5161" not in text
-    assert "paper" not in summary.split("\n\n")[1]
-    assert "µm/\u2060s" in text

@@ -33,8 +33,8 @@ def test_each_guard_is_rehearsed_at_rest_and_boxes_within_reach_are_named(guarde
     found = findings(guarded)
     ((level, what),), _ = found[SENSOR]
     assert level == "ok"
-    assert "its guard stops probe_stage beyond 1000 µN; at " in what
-    assert "as no max_speed_um_s is stated, it goes on for " in what
+    assert "its guard stops probe_stage beyond 1000 µN; until it stands, it goes on by up to " in what
+    assert "at a speed of 1000 µm/s (its largest; the guard states no max_speed_um_s)" in what
     assert found[STAGE][0] == [("ok", "its tip could reach and is kept out of: slide")]
     assert [event.by for event in guarded.stops()] == ["force guard"] * REHEARSALS
     assert guarded.rules() == []
@@ -50,7 +50,15 @@ def test_the_way_on_is_that_of_the_largest_speed_allowed(tmp_path):
         ((_, what),), _ = findings(guarded)[SENSOR]
         acceleration = min(axis.acceleration for axis in guarded.stage.axes.values())
     way_um = 100.0 / 200.0 + 100.0**2 / (2.0 * acceleration)
-    assert f"at 100 µm/s, its max_speed_um_s, it goes on for {way_um:.2g} µm" in what
+    assert f"by up to {way_um:.2g} µm at a speed of 100 µm/s (the guard's max_speed_um_s)" in what
+
+
+def test_a_tool_without_guard_and_boxes_is_a_warning(tmp_path):
+    with guarded_rig(tmp_path, clock=SimulatedClock(), safety="none") as guarded:
+        found = findings(guarded)
+    (sensor,), (stage,) = found[SENSOR][0], found[STAGE][0]
+    assert sensor == ("warning", "no force guard watches it: nothing stops probe_stage if it presses too hard")
+    assert stage == ("ok", "no keep_out box limits where its tip may go")
 
 
 def test_a_stage_in_motion_is_not_stopped_for_a_rehearsal(guarded):

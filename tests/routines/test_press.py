@@ -6,15 +6,25 @@ import msgspec
 import pytest
 
 from microdrivers.core.clock import SimulatedClock
-from microdrivers.core.errors import DataError, MicrodriversError, MoveCancelled, NoContact, OutOfRange, TargetLost
+from microdrivers.core.errors import (
+    DataError,
+    MicrodriversError,
+    MoveCancelled,
+    NoContact,
+    OutOfRange,
+    TargetLost,
+    UnsafeError,
+)
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.vision.contact_patch import contact_patch
 from microdrivers.rig import open_rig
+from microdrivers.rig.safety_keep_out import KeepOut
+from microdrivers.rig.safety_section import KeepOutBox
 from microdrivers.routines.force import Characterisation, PressExperiment, sight
 from microdrivers.routines.progress import SilentProgress
 from tests.routines.small_rig import SHORT, small_rig
 
-AWAY_UM = 300.0
+AWAY_UM, RETRACT_UM = 300.0, 400.0
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +122,38 @@ def test_a_guard_that_trips_on_the_way_back_leaves_a_partial_result(rig):
     characterisation, error = run(rig, steps=steps)
     assert isinstance(error, MoveCancelled)
     assert "force guard" in error.what
-    assert probe_um(rig) > -490.0 + AWAY_UM
+    assert -490.0 + AWAY_UM < probe_um(rig) < -400.0 + RETRACT_UM  # once
     partial = characterisation.partial(error)
     assert not partial.complete
     assert partial.ended_by == error.what
     assert partial.identification.protocols["loading"].k1_uN_per_um == pytest.approx(5.8781, rel=0.1)
+
+
+def test_a_guard_that_trips_while_the_press_is_ended_is_what_ended_it(rig):
+    since_ns = []
+
+    def rising_uN(t_ns):
+        return 0.0 if probe_um_now() > -440.0 else 1200.0 if t_ns < since_ns[0] + 12_000_000 else 1600.0
+
+    def too_much():
+        since_ns.append(rig.clock.now_ns())
+        rig.simulation.world.pressed["probe_force"] = rising_uN
+
+    axis = rig.simulation.world.fine_stage_axes["probe_stage"]["x"]
+
+    def probe_um_now():
+        return axis.position_at(rig.clock.now_ns())
+
+    told = []
+    steps = Steps("pressing at", lambda: later(rig, 1.1, too_much))
+    begin = steps.step
+    steps.step = lambda text: (told.append(text), begin(text))
+    _, error = run(rig, SHORT._replace(max_force_uN=999.9), steps=steps)
+    assert [text for text in told if text.startswith("pressing")] == ["pressing at 40 µm/s, to 30 µm or 999.9 µN"]
+    assert isinstance(error, MoveCancelled)
+    assert "the force guard intervened: probe_force feels" in error.what
+    assert "far enough" not in error.what
+    assert -490.0 + AWAY_UM < probe_um(rig) < -400.0 + RETRACT_UM  # once
 
 
 class Blind:
@@ -165,6 +202,8 @@ def test_a_limit_that_ends_the_press_at_once_is_named(rig):
     assert "press slower than 40 µm/s" in error.remedy
     assert len(characterisation.first.frames) > 20
     assert probe_um(rig) > -490.0 + AWAY_UM
+    assert characterisation.partial(error) is None
+    assert re.match(r"the force leaves its noise in only \d+ of \d+ frames, by up to ", characterisation.tells_nothing)
 
 
 def test_the_speed_that_a_guard_allows_is_kept_on_free_ways(rig, monkeypatch):
@@ -185,3 +224,32 @@ def test_settings_that_cannot_be_are_refused(rig):
     for change in ({"speed_um_s": 300.0}, {"depth_um": 0.0}, {"max_force_uN": 1600.0}):
         with pytest.raises(OutOfRange):
             PressExperiment(rig, SHORT._replace(**change))
+
+
+def test_what_stage_and_guard_forbid_is_refused_before_anything_moves(rig, monkeypatch):
+    with pytest.raises(OutOfRange, match="goes on for 235 µm, of which 1000 µm are to be pressed"):
+        PressExperiment(rig, SHORT._replace(depth_um=1000.0))
+    with pytest.raises(OutOfRange, match="back for 1015 µm, of which 1100 µm are needed"):
+        PressExperiment(rig, SHORT._replace(free_travel_um=1100.0))
+    monkeypatch.setattr(type(rig.safety), "max_speed_um_s", lambda _self, _sensor: 39.0)
+    with pytest.raises(OutOfRange, match=r"its force guard allows \(max_speed_um_s\): 39 µm/s") as refused:
+        PressExperiment(rig, SHORT)
+    assert "--speed-um-s" in refused.value.remedy
+    PressExperiment(rig, SHORT._replace(speed_um_s=39.0))
+
+
+def test_a_keep_out_box_on_the_way_is_told_before_anything_moves(rig, monkeypatch):
+    stage = rig.devices["probe_stage"]
+    stage.reference([axis for axis in stage.reference_order if not stage.referenced[axis]] or ["x"])
+    x, y, z = stage.tip_um({"x": -520.0, "y": 0.0, "z": 0.0})
+    box = KeepOutBox(name="wall", min_um=(x - 20.0, y - 50.0, z - 50.0), max_um=(x + 20.0, y + 50.0, z + 50.0))
+    monkeypatch.setattr(rig.safety, "keep_out", KeepOut([box]))
+    with pytest.raises(UnsafeError, match="too near to the keep-out box 'wall'"):
+        PressExperiment(rig, SHORT)
+
+
+def test_a_picture_in_which_nothing_moves_asks_for_tip_and_specimen(rig):
+    frames = [rig.devices["camera_fine"].grab() for _ in range(6)]
+    with pytest.raises(DataError, match="nothing in the picture moved while the probe travelled 100 µm") as caught:
+        sight.Sight().learn(frames, [20.0 * k for k in range(6)], scale_hint_px_per_um=0.25)
+    assert "specimen" in caught.value.remedy

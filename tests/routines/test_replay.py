@@ -13,6 +13,7 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.recorder import Recorder
 from microdrivers.recording.replay import Replay
 from microdrivers.rig import open_rig
+from microdrivers.routines.analysis import analyse_recording
 from microdrivers.routines.force import (
     Characterisation,
     IndentationReplay,
@@ -67,6 +68,64 @@ def test_the_first_frames_of_a_recorded_calibration_know_nothing_of_what_follows
     assert bits(again.estimates) == bits(run.estimates[:28])
     result = build_optics_result(again, provenance)
     assert (result.complete, result.frames, result.zoom_change, result.notes) == (True, 28, None, [])
+
+
+@pytest.mark.parametrize("frames", [32, 33])
+def test_a_run_that_ends_in_a_change_of_zoom_says_so_once(calibrated, frames):
+    provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
+    with Recording(calibrated[1]) as recording:
+        result = build_optics_result(calibrate_optics(OpticsReplay(recording, frames=frames)), provenance)
+    assert len(result.notes) == 1
+    assert "this is the calibration at zoom 0.8999" in result.notes[0]
+    assert "Texture" not in result.notes[0]
+
+
+def damaged(file, copy, is_it):
+    """A copy of which the chunks are damaged that hold such samples of these topics."""
+    data = bytearray(file.read_bytes())
+    with Recording(file) as recording:
+        read = recording._read_messages
+
+        def look(place, chunk, *arguments):
+            found = read(place, chunk, *arguments)
+            if any(is_it(sample) for _, sample in found):
+                data[place.offset + place.length - 1] ^= 1
+            return found
+
+        recording._read_messages = look
+        for _ in recording.samples():
+            pass
+    copy.write_bytes(data)
+    return copy
+
+
+@pytest.mark.parametrize(("numbers", "used"), [((3,), 59), ((59,), 59), ((40, 41), 58), ((60,), 60)])
+def test_frames_that_a_recording_lacks_are_lost_and_no_later_one_takes_their_place(calibrated, tmp_path, numbers, used):
+    run, file = calibrated
+    with Recording(file) as recording:
+        frames = [sample for _, sample in recording.samples(["camera_fine"]) if sample.order in set(run.arrivals)]
+    lost = [frames[number].order for number in numbers]
+    copy = damaged(file, tmp_path / "run.mcap", lambda sample: sample.order in lost)
+    provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
+    with Recording(copy) as recording:
+        again = calibrate_optics(OpticsReplay(recording))
+        result = build_optics_result(again, provenance)
+    assert [each.t_ns for each in again.estimates] == [
+        each.t_ns for index, each in enumerate(run.estimates) if index not in numbers
+    ]
+    assert (result.frames, result.lost_frames) == (used, 60 - used)
+    samples = "1 sample" if len(numbers) == 1 else "2 samples"
+    told = f"The result is from a recording with a flaw: it lacks {samples} that the estimators had"
+    assert result.notes[0].startswith(told)
+    assert (f"among them {60 - used} frame" in result.notes[0]) == (used < 60)
+
+
+def test_a_calibration_whose_beginning_is_damaged_is_called_so(calibrated, tmp_path):
+    for named in ("optics/begin", "optics/"):
+        copy = damaged(calibrated[1], tmp_path / "run.mcap", lambda s, n=named: getattr(s, "kind", "").startswith(n))
+        with Recording(copy) as recording, pytest.raises(UnsupportedError, match="note of its beginning is in what is"):
+            OpticsReplay(recording)
+        assert "note of its beginning is in what is" in analyse_recording(str(copy))["error"]
 
 
 def test_an_interrupted_calibration_stays_one_when_it_is_replayed(tmp_path):

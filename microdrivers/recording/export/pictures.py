@@ -20,6 +20,7 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import notes_of
 
 _INFO = ("t_ns", "exposure_ms", "frame_id", "seq", "dropped_before", "settings_id", "bit_depth")
+_MISSING = "missing_before"
 _RIFF = struct.Struct("<4sI")
 """What an AVI file begins with: `RIFF`, and how many bytes follow."""
 
@@ -58,7 +59,10 @@ def track_of(recording: Recording, camera: str) -> list[Track]:
 
 
 class ImageFolder:
-    """Writes frames as numbered PNG files, lossless, with `frames.csv`, as `calibrate optics --images` reads it."""
+    """Writes frames as numbered PNG files, lossless, with `frames.csv`, as `calibrate optics --images` reads it.
+
+    In the table, `missing_before` is how many frames the recording lacks before this one, as their `seq` tells.
+    """
 
     batch = 1
 
@@ -68,9 +72,10 @@ class ImageFolder:
         self._tracks = tracks
         self._start_ns = start_ns
         self._count = 0
+        self._before: int | None = None
         self._stream = (folder / "frames.csv").open("x", encoding="utf-8", newline="")
         self._table = csv.writer(self._stream, lineterminator="\n")
-        self._table.writerow(["file", "time_s", *(name for track in tracks for name in track.values), *_INFO])
+        self._table.writerow(["file", "time_s", *(name for track in tracks for name in track.values), *_INFO, _MISSING])
 
     def write(self, samples: list[Sample]) -> None:
         """Append frames."""
@@ -85,7 +90,9 @@ class ImageFolder:
             (self._folder / name).write_bytes(data.tobytes())
             places = [value for track in self._tracks for value in track.at(frame.t_ns).values()]
             time_s = (frame.t_ns - self._start_ns) / NS_PER_S
-            self._table.writerow([name, time_s, *places, *(getattr(frame, field) for field in _INFO)])
+            missing = 0 if self._before is None else max(0, frame.seq - self._before - 1)
+            self._table.writerow([name, time_s, *places, *(getattr(frame, field) for field in _INFO), missing])
+            self._before = frame.seq
             self._count += 1
 
     def close(self) -> None:

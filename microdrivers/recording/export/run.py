@@ -57,8 +57,9 @@ def export_recording(
 ) -> ExportReport:
     """Write a recording's topics to the folder `out`, which is made if it is not there.
 
-    One file a topic (a folder of images for `images`), one for all of them for `hdf5`. The files appear when all of
-    them are complete; an export that fails or is interrupted leaves none.
+    One file a topic (a folder of images for `images`), one for all of them for `hdf5`. What is wrong with the recording
+    is in `<name>-flaws.txt` beside them. The files appear when all of them are complete; an export that fails or is
+    interrupted leaves none.
 
     Args:
         recording: what is exported.
@@ -81,7 +82,12 @@ def export_recording(
     with ExitStack() as outer:
         suffix = {"csv": ".csv", "parquet": ".parquet", "images": "", "video": ".avi"}.get(to, "")
         files = {topic: f"{recording.file.stem}.h5" if to == "hdf5" else f"{names[topic]}{suffix}" for topic in chosen}
-        stage = outer.enter_context(staged(out, dict.fromkeys(files.values())))
+        flaws = "".join(f"{flaw}\n" for flaw in recording.flaws)
+        told = f"{recording.file.stem}-flaws.txt"
+        tells = bool(flaws) and not _holds(out / told, flaws)
+        stage = outer.enter_context(staged(out, dict.fromkeys([*files.values(), *([told] if tells else [])])))
+        if tells:
+            (stage / told).write_text(flaws, encoding="utf-8")
         writers: dict[str, TopicWriter] = {}
         with ExitStack() as stack:
             make = _maker(recording, to, stage, files, names, start, stack, list(chosen))
@@ -112,6 +118,8 @@ def export_recording(
         for topic, writer in writers.items()
         if isinstance(writer, VideoFile) and writer.left_out
     ]
+    if flaws:
+        remarks.append(f"{out / told}: what is wrong with the recording")
     by_file: dict[Path, int] = {}
     for topic, number in written.items():
         by_file[out / files[topic]] = by_file.get(out / files[topic], 0) + number
@@ -164,6 +172,11 @@ def _maker(
     stack.callback(file.close)
     widths = text_widths(recording, topics)
     return lambda topic, found: file.topic(names[topic], topic, found.sample_type, widths.get(topic, {}))
+
+
+def _holds(file: Path, text: str) -> bool:
+    """Whether an earlier export of the recording has left that there."""
+    return file.is_file() and file.read_bytes() == text.encode()
 
 
 def _light(sample: Sample) -> Sample:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import tempfile
@@ -39,6 +40,7 @@ def staged(out: Path, names: Iterable[str]) -> Iterator[Path]:
     targets = [out / name for name in names]
     for target in targets:
         _refuse_existing(target)
+    is_new = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
         stage = Path(tempfile.mkdtemp(prefix=".export-", dir=out))
@@ -54,6 +56,9 @@ def staged(out: Path, names: Iterable[str]) -> Iterator[Path]:
         raise not_writable(out, error) from error
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+        if is_new:
+            with contextlib.suppress(OSError):  # it is not empty: all went well
+                out.rmdir()
 
 
 def _refuse_existing(target: Path) -> None:

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -29,17 +30,23 @@ Analyse = Callable[[str], Row]
 
 
 class BatchReport(NamedTuple):
-    """What became of a batch: rows of the table, those of them that an earlier run had left, and those with errors."""
+    """What became of a batch: rows of the table, and how many of them an earlier run had left or have an error."""
 
     rows: list[Row]
     resumed: int
     failed: int
 
+    @property
+    def incomplete(self) -> int:
+        """Of how many recordings that were analysed something is lost."""
+        return sum(row["error"] is None and bool(row["losses"] or row["dropped"]) for row in self.rows)
+
 
 def find_recordings(runs: Sequence[Path]) -> list[str]:
     """The recordings that are meant: files as they are, of folders all `*.mcap` in and below; sorted.
 
-    Each is there once, also if links or several ways of writing its path lead to it: by the first of these.
+    Links to folders are followed, and one that leads nowhere is a recording that cannot be read. Each is there once,
+    also if links or several ways of writing its path lead to it: by the first of these.
 
     Raises:
         ConfigError: there is no such file or folder, or a folder holds no recording, or what is named is neither.
@@ -50,11 +57,28 @@ def find_recordings(runs: Sequence[Path]) -> list[str]:
             raise ConfigError("there is no such recording", file=str(run), remedy="check the path")
         if not (run.is_file() or run.is_dir()):  # a pipe lets its reader wait
             raise ConfigError("it is neither a file nor a folder", file=str(run), remedy="name recordings")
-        inside = [str(file) for file in run.rglob("*.mcap") if file.is_file()] if run.is_dir() else [str(run)]
+        inside = [str(file) for file in _recordings_below(run)] if run.is_dir() else [str(run)]
         if not inside:
             raise ConfigError("the folder holds no *.mcap", file=str(run), remedy="name recordings or their folders")
         found.update(inside)
     return sorted({os.path.realpath(file): file for file in sorted(found, reverse=True)}.values())
+
+
+def _recordings_below(folder: Path) -> Iterator[Path]:
+    """All `*.mcap` in and below a folder; each folder is entered once, by a link only if no other way leads to it."""
+    entered: set[str] = set()
+    tops = deque([folder])
+    while tops:
+        for root, folders, names in os.walk(tops.popleft()):
+            real = os.path.realpath(root)
+            if real in entered:
+                folders.clear()
+                continue
+            entered.add(real)
+            tops.extend(Path(root, name) for name in sorted(folders) if Path(root, name).is_symlink())
+            for file in (Path(root, name) for name in names if name.endswith(".mcap")):
+                if file.is_file() or (file.is_symlink() and not file.exists()):
+                    yield file
 
 
 def analyse_recordings(

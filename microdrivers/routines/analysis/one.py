@@ -74,7 +74,9 @@ def _origin(header: RecordingHeader) -> Row:
 
 
 def _analyse(recording: Recording) -> Row:
-    kinds = {note.kind.partition("/")[0] for note in notes_of(recording)}
+    # Where all notes are in what is damaged, the inbox of its estimator still tells what it was.
+    names = (*(note.kind for note in notes_of(recording)), *recording.arrivals)
+    kinds = {name.partition("/")[0] for name in names}
     if "optics" in kinds:
         return _optics_row(analyse_optics(recording))
     if "force" in kinds:

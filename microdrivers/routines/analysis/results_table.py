@@ -58,7 +58,7 @@ class ResultsTable:
             self._lock()
             self._read()
         except BaseException:
-            self._stream.close()
+            self._close_stream()
             raise
 
     def is_done(self, file: str) -> bool:
@@ -96,7 +96,11 @@ class ResultsTable:
         if not self.rows:
             with contextlib.suppress(OSError):
                 self.journal.unlink(missing_ok=True)
-        self._stream.close()
+        self._close_stream()
+
+    def _close_stream(self) -> None:
+        with contextlib.suppress(OSError):  # what a full disk has refused is tried again, and has been told
+            self._stream.close()
 
     def __enter__(self) -> ResultsTable:
         return self
@@ -128,7 +132,11 @@ class ResultsTable:
             self._stream.truncate(len(whole) + 1 if whole else 0)
         lines = whole.splitlines()
         if not lines:
-            self._append(begin)
+            try:
+                self._append(begin)
+            except ConfigError:
+                self.journal.unlink(missing_ok=True)
+                raise
             return
         if _parsed(lines[0]) != begin:
             raise ConfigError(
@@ -153,7 +161,7 @@ class ResultsTable:
         return ConfigError(
             f"the table cannot be written: {error.strerror or error}",
             file=str(self.file),
-            remedy="choose another --out",
+            remedy="choose another --out, in a folder that may be written, on a disk with space left",
         )
 
 

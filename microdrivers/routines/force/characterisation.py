@@ -24,7 +24,7 @@ from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.force.recursion import SpecimenRecursion
 from microdrivers.estimators.force.vision_force import VisionForce
 from microdrivers.estimators.vision.image_drift import ImageDrift
-from microdrivers.routines.force.frames import all_frames, drift_of, record_of, without_drift
+from microdrivers.routines.force.frames import all_frames, drift_of, in_contact_uN, record_of, without_drift
 from microdrivers.routines.force.source import DONE, FrameTracker, IndentationSetup, IndentationSource, host_name
 from microdrivers.routines.notes import note
 from microdrivers.routines.past_run import INTERRUPTED, PastRun
@@ -131,9 +131,11 @@ class Characterisation:
             return None
         try:
             return self._found(error.what)
+        except NoContact:
+            self.tells_nothing = f"no contact shows in its {len(self.first.frames)} frames"
         except (DataError, CalibrationError) as why:
             self.tells_nothing = why.what
-            return None
+        return None
 
     def _experiment(self, progress: Progress, *, check: bool) -> None:
         source = self._source
@@ -150,12 +152,25 @@ class Characterisation:
         assert self.first is not None
         if self._record is None or self._identification is None:
             self._record = record_of(self.first.frames)
-            self._identification = identify(self._record, self._settings)
+            self._identification = self._identified(self._record, self.first.frames)
         source = self._source
         return ForceRun(
             not ended_by, ended_by, self.first, self._record, self._identification, self.check, source.setup(),
             source.past_run,
         )  # fmt: skip
+
+    def _identified(self, record: IndentationRecord, frames: list[IndentationSample]) -> Identification:
+        try:
+            return identify(record, self._settings)
+        except NoContact as error:
+            felt_uN = in_contact_uN(frames)
+            if not felt_uN:
+                raise
+            raise DataError(
+                f"the force leaves its noise in only {len(felt_uN)} of {len(frames)} frames, by up to "
+                f"{max(felt_uN):.4g} µN",
+                remedy="press slower or deeper, so that more frames see the specimen pressed",
+            ) from error
 
     def _indent(self, tracker: FrameTracker | None, model: SpecimenModel | None, progress: Progress) -> None:
         """One indentation: `first` or, with a model of the specimen, `check`; kept whatever ends it."""

@@ -16,8 +16,11 @@ from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.vision.image_drift import ImageDrift, image_drift
 from microdrivers.routines.force.source import Rests
 
-_TOUCHES_UN = 1.0
-"""A change of the force at rest by which a tool must touch: its own spring is bent then."""
+TOUCHES_UN = 1.0
+"""A change of the force by which a tool must touch: its own spring is bent then."""
+
+_CLEAR = 8.0
+"""Standard deviations that are no noise."""
 
 
 def all_frames(
@@ -64,7 +67,7 @@ def drift_of(
         [sample.force_uN for sample in matched if sample.t_ns <= rests.until_ns],
         [sample.force_uN for sample in matched if sample.t_ns >= rests.since_ns],
     )
-    if not before or not after or abs(float(np.mean(after) - np.mean(before))) > _TOUCHES_UN:
+    if not before or not after or abs(float(np.mean(after) - np.mean(before))) > TOUCHES_UN:
         return None
     return image_drift(
         [sample for sample in deformations if sample.t_ns <= rests.until_ns],
@@ -72,6 +75,16 @@ def drift_of(
         travel_um=rests.travel_um,
         travel_sigma_um=rests.travel_sigma_um,
     )
+
+
+def in_contact_uN(frames: Iterable[IndentationSample]) -> list[float]:
+    """How far the force is off its usual value in those frames where it clearly is; most frames are of a free tool."""
+    known = np.array([frame.force_uN for frame in frames if math.isfinite(frame.force_uN)])
+    if not len(known):
+        return []
+    off = np.abs(known - np.median(known))
+    found: list[float] = off[off > max(TOUCHES_UN, _CLEAR * float(np.median(off)) / 0.6745)].tolist()
+    return found
 
 
 def without_drift(frames: Sequence[IndentationSample], drift: ImageDrift | None) -> list[IndentationSample]:

@@ -8,13 +8,14 @@ from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample
-from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced, OutOfRange
+from microdrivers.core.errors import ConfigError, MoveCancelled, NoContact, NotReferenced
 from microdrivers.core.samples import ForceSample, Frame
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.rig import Rig
+from microdrivers.routines.force.press_checks import check_press
 from microdrivers.routines.force.press_settings import PressSettings
 from microdrivers.routines.force.sight import Sight
 from microdrivers.routines.force.source import (
@@ -69,7 +70,11 @@ class PressExperiment:
         self._sight = sight or Sight()
         self._guard_uN = rig.safety.limit_uN(self._sensor.name)
         self._limit_uN = self.settings.limit_uN(self._sensor.range_uN, guard_uN=self._guard_uN)
-        self._free_um_s = min(self.settings.free_speed_um_s, rig.safety.max_speed_um_s(self._sensor.name))
+        allowed_um_s = (rig.safety.max_speed_um_s(self._sensor.name), *self._stage.max_speed.values())
+        self._free_um_s = min(self.settings.free_speed_um_s, *allowed_um_s)
+        ready_um = section.ready_um
+        self._ready_um = None if ready_um is None else dict(zip(self._stage.axis_names, ready_um, strict=True))
+        check_press(rig, self._stage, self._sensor, self.settings, self._ready_um)
         self._way: ProbingWay | None = None
         self._contact_um = math.nan
         self._near = False
@@ -82,10 +87,12 @@ class PressExperiment:
     def prepare(self, progress: Progress) -> FrameTracker:
         """Bring the probe up, tare, measure the scale, find the specimen, and choose what is tracked."""
         self._require_referenced(progress)
-        if self._section.ready_um is not None:
-            x_um, y_um, z_um = self._section.ready_um
-            progress.step(f"probe to its place before the specimen, ({x_um:g}, {y_um:g}, {z_um:g}) µm")
-            self._stage.move_to(x_um=x_um, y_um=y_um, z_um=z_um, speed_um_s=self._free_um_s)
+        start_um = self._ready_um or self._stage.read().position
+        check_press(self._rig, self._stage, self._sensor, self.settings, start_um)
+        if self._ready_um is not None:
+            at = ", ".join(f"{um:g}" for um in self._ready_um.values())
+            progress.step(f"probe to its place before the specimen, ({at}) µm")
+            self._stage.move_to(**{f"{axis}_um": um for axis, um in self._ready_um.items()}, speed_um_s=self._free_um_s)
         self._way = way = ProbingWay(self._stage, self._sensor, self._stage.read().position)
         progress.step("tare: the probe touches nothing")
         self._sensor.tare(self.settings.tare_s)
@@ -95,7 +102,7 @@ class PressExperiment:
         self._near = True
         self._contact_um = self._approach(way)
         progress.step(f"contact after {self._contact_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
-        self._go(way, self._contact_um - self.settings.back_off_um, self._free_um_s)
+        self._go(way, self._contact_um - self.settings.back_off_um)
         self.clock.sleep(self.settings.rest_s)
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
         ahead_um = self._contact_um - way.place_um(self._stage.read().position)
@@ -146,7 +153,7 @@ class PressExperiment:
         frames: list[Frame] = []
         places_um: list[float] = []
         for step in range(steps + 1):
-            self._go(way, -travel_um * (1.0 - step / steps), self._free_um_s)
+            self._go(way, -travel_um * (1.0 - step / steps))
             places_um.append(way.place_um(self._stage.read().position))
             frames.append(self._camera.grab())
             progress.count(step + 1, steps + 1)
@@ -163,14 +170,7 @@ class PressExperiment:
         tare = self._sensor.tared
         threshold_uN = max(_LEAST_CONTACT_UN, _CONTACT_SIGMAS * (tare.sigma_uN if tare is not None else 0.0))
         felt = Felt(threshold_uN, _CONTACT_READINGS)
-        end_um = min(self.settings.most_approach_um, way.longest_um() - self.settings.depth_um)
-        if end_um <= 0.0:
-            raise OutOfRange(
-                f"the stage's travel ends {way.longest_um():.0f} µm ahead, and {self.settings.depth_um:g} µm are to "
-                "be pressed",
-                device=self._stage.name,
-                remedy="start nearer to the middle of the travel, or press less deep",
-            )
+        end_um = self.settings.approach_um(way.longest_um())
         with self._readings(felt):
             reached = self._run(way, end_um, lambda: felt.enough)
         if not felt.enough:
@@ -194,12 +194,12 @@ class PressExperiment:
         assert self._way is not None
         way, asked = self._way, self.settings
         start_um, end_um = self._contact_um - asked.back_off_um, self._contact_um + asked.depth_um
-        self._go(way, start_um, self._free_um_s)
+        self._go(way, start_um)
         if self._indented:
             self._let_recover(progress)
         self._indented = True
         unguarded = "" if self._guard_uN is not None else "; NO FORCE GUARD watches (safety: none)"
-        to = f"to {asked.depth_um:g} µm or {self._limit_uN:.0f} µN{unguarded}"
+        to = f"to {asked.depth_um:g} µm or {self._limit_uN:.4g} µN{unguarded}"
         progress.step(f"pressing at {asked.speed_um_s:g} µm/s, {to}")
         felt, lost = Felt(self._limit_uN, 1), Lost()
         total = round(2.0 * (end_um - start_um))
@@ -244,8 +244,8 @@ class PressExperiment:
             self.clock.sleep(_WATCH_S)
         progress.step(f"the specimen still moves after {_LONGEST_RECOVERY_S:g} s; going on")
 
-    def _go(self, way: ProbingWay, place_um: float, speed_um_s: float) -> None:
-        self._stage.move_to(**way.targets(place_um), speed_um_s=way.path_speed_um_s(speed_um_s))
+    def _go(self, way: ProbingWay, place_um: float) -> None:
+        self._stage.move_to(**way.targets(place_um), speed_um_s=self._free_um_s)
 
     def _run(
         self,
@@ -261,7 +261,7 @@ class PressExperiment:
         told: list[bool] = []
 
         def stop_once(_sample: ForceSample) -> None:
-            if enough() and not told:
+            if enough() and not told and not self._rig.safety.tripped:
                 told.append(True)
                 self._stage.stop(by="experiment", reason="far enough")
 
@@ -269,9 +269,15 @@ class PressExperiment:
         seen = self._stage.topic.subscribe(lambda pose: show(way.place_um(pose.position)))
         try:
             move.wait()
-        except MoveCancelled:
-            if not told or self._rig.safety.tripped:
+        except MoveCancelled as cancelled:
+            if not told:
                 raise
+            if tripped := "; ".join(self._rig.safety.tripped.values()):  # while the stage still braked
+                raise MoveCancelled(
+                    f"the force guard intervened: {tripped}",
+                    device=self._stage.name,
+                    remedy="press slower, or turn back farther below the limit: --max-force-uN",
+                ) from cancelled
             self._rest()
         finally:
             watch.cancel()
@@ -310,7 +316,7 @@ class PressExperiment:
         if self._way is None or self._stage.link != "open":
             return
         self._rest()
-        if self._near and self._stage.retract_um is not None:
+        if self._near and self._stage.retract_um is not None and not self._rig.safety.took_away(self._stage.name):
             self._stage.retract().wait()
             self._near = False
         position = self._stage.read().position

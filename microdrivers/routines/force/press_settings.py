@@ -55,6 +55,10 @@ class PressSettings(NamedTuple):
         if self.max_force_uN == 0.0:
             raise OutOfRange("max_force_uN is 0", remedy="give a largest force above 0 µN")
 
+    def approach_um(self, longest_um: float) -> float:
+        """How far to look for the specimen where the way is so long: the depth must still fit in."""
+        return min(self.most_approach_um, longest_um - self.depth_um)
+
     def limit_uN(self, range_uN: Range, *, guard_uN: float | None) -> float:
         """The force at which pressing ends by itself, before a guard must act.
 

@@ -15,7 +15,7 @@ from microdrivers.devices.force_sensor import SATURATED
 from microdrivers.estimators.force.motion_limit import largest_speed_um_s
 from microdrivers.estimators.force.protocol_fit import ProtocolFit
 from microdrivers.estimators.force.record import IndentationRecord, saturated
-from microdrivers.estimators.force.vision_force import OUTSIDE_RANGE
+from microdrivers.estimators.force.vision_force import MAY_BE_RELEASED, OUTSIDE_RANGE
 from microdrivers.results.force import (
     Contact,
     ForceResult,
@@ -29,9 +29,17 @@ from microdrivers.results.force import (
 )
 from microdrivers.results.record import Provenance, Trace
 from microdrivers.routines.force.characterisation import ForceRun, Indentation
+from microdrivers.routines.force.frames import TOUCHES_UN
 from microdrivers.routines.force.source import IndentationSetup
 
 Array = npt.NDArray[np.float64]
+
+_FEWEST_IN_CONTACT = 10
+_CAME_BACK = 0.5
+"""Of the deepest: an indentation that ends above it had no reversal yet, as far as is known."""
+
+_LEFT = 0.5
+"""Of the camera's force: what the sensor feels less than, of a specimen that has been let go."""
 
 
 def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
@@ -39,7 +47,8 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
     found = run.identification
     best = found.protocols[found.best]
     check = compare(run.check) if run.check is not None else None
-    largest_uN = float(np.nanmax(np.where(saturated(run.record), np.nan, run.record.force_uN)))
+    borne_uN = run.record.force_uN - found.baseline_uN
+    largest_uN = float(np.nanmax(np.where(saturated(run.record), np.nan, borne_uN)))
     return ForceResult(
         complete=run.complete,
         contact=Contact(
@@ -71,24 +80,33 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
 
 
 def compare(check: Indentation) -> VisionCheck | None:
-    """The camera's force against the sensor's, frame by frame; None without a common frame."""
+    """The camera's force against the sensor's, frame by frame; None if hardly a common frame saw contact."""
     pairs = _pairs(check)
     if not pairs:
         return None
     measured = np.array([sample.force_uN for sample, _ in pairs])
     seen = np.array([force.force_uN for _, force in pairs])
-    power = float(np.sqrt(np.mean(measured**2)))
-    if not power > 0.0:
+    if np.sum(np.abs(measured) > TOUCHES_UN) < _FEWEST_IN_CONTACT:
         return None
+    power = float(np.sqrt(np.mean(measured**2)))
     off = np.abs(seen - measured)
     since_s = [(sample.t_ns - pairs[0][0].t_ns) / NS_PER_S for sample, _ in pairs]
+    pressed_um = [sample.deformation_um for sample, _ in pairs]
     return VisionCheck(
         error_percent=100.0 * float(np.sqrt(np.mean(off**2))) / power,
         largest_error_uN=float(np.max(off)),
         largest_error_s=since_s[int(np.argmax(off))],
-        deepest_s=since_s[int(np.argmax([sample.deformation_um for sample, _ in pairs]))],
+        deepest_s=since_s[int(np.argmax(pressed_um))] if pressed_um[-1] < _CAME_BACK * max(pressed_um) else None,
         samples=len(pairs),
         outside_range=sum(OUTSIDE_RANGE in force.flags for _, force in pairs),
+        left_over_uN=max(
+            (
+                force.force_uN
+                for sample, force in pairs
+                if MAY_BE_RELEASED in force.flags and sample.force_uN < _LEFT * force.force_uN
+            ),
+            default=None,
+        ),
     )
 
 
@@ -171,7 +189,8 @@ def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
     known, drift = run.setup, run.first.drift
     branches = run.identification.branches
     in_um_s = _mean_speed_um_s(run.record, branches.loading) or best.fastest_um_s
-    out_um_s = _mean_speed_um_s(run.record, branches.unloading)
+    both_ways = "single" in run.identification.protocols
+    out_um_s = _mean_speed_um_s(run.record, branches.unloading) if both_ways else None
     return Setup(
         sensor=known.sensor,
         stage=known.stage,
@@ -189,7 +208,7 @@ def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
         unloading_speed_um_s=out_um_s if known.speed_um_s is None or out_um_s is None else known.speed_um_s,
         pressed_um=float(np.nanmax(run.record.deformation_um)) - best.contact_um,
         fastest_um_s=best.fastest_um_s,
-        fastest_unloading_um_s=best.fastest_unloading_um_s,
+        fastest_unloading_um_s=best.fastest_unloading_um_s if both_ways else None,
     )
 
 
@@ -252,6 +271,15 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
         notes.append(
             f"{check.outside_range} of {check.samples} frames of the fresh indentation lie outside the range in which "
             "the model was identified."
+        )
+    if check is None and run.check is not None:
+        notes.append(
+            "The fresh indentation had hardly begun to press when it ended: it tells nothing of force from the camera."
+        )
+    if check is not None and check.left_over_uN is not None:
+        notes.append(
+            f"The camera told up to {check.left_over_uN:.3g} µN after the tip had left in the fresh indentation: the "
+            "specimen lies farther in than this model has it. Such frames are flagged MAY_BE_RELEASED."
         )
     best = protocols[run.identification.best]
     if best.misfit.found:

@@ -15,7 +15,7 @@ from microdrivers.devices.force_sensor import ForceSensor
 from microdrivers.devices.zoom_motor import ZoomMotor
 from microdrivers.estimators.vision.contact import DeformationTracker, ImageScale
 from microdrivers.estimators.vision.contact_patch import contact_patch
-from microdrivers.estimators.vision.moving_tip import TipView, find_moving_tip
+from microdrivers.estimators.vision.moving_tip import NoMovingTip, TipView, find_moving_tip
 from microdrivers.estimators.vision.template import FloatArray
 from microdrivers.results.optics import OpticsResult, read_result
 from microdrivers.rig import Rig
@@ -89,7 +89,16 @@ class Sight:
         Raises:
             NoMovingTip: nothing moves as the probe does. StaleCalibration: the travel contradicts the calibration.
         """
-        tip = find_moving_tip(frames, travel_um, scale_hint_px_per_um=scale_hint_px_per_um)
+        try:
+            tip = find_moving_tip(frames, travel_um, scale_hint_px_per_um=scale_hint_px_per_um)
+        except NoMovingTip as error:
+            if error.reason == "nothing_moved":
+                error.what = f"nothing in the picture moved while the probe travelled {np.ptp(travel_um):.0f} µm"
+                error.remedy = (
+                    "see that the probe's tip, and the specimen before it, are in view, in focus and lit; an emulated "
+                    "rig shows neither without a specimen (--specimen)"
+                )
+            raise
         if self._projection is not None:
             _require_agreement(tip, self._projection)
         self._tip = tip

@@ -144,10 +144,11 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
     Raises:
         IllConditioned: the run does not determine a calibration; the message says what was missing.
     """
+    lost_frames = run.lost_frames + run.past_run.lost_frames
     choice = choose_estimate(
         run.estimates,
         pixel_pitch_um=run.optics.pixel_pitch_um,
-        lost_frames=run.lost_frames,
+        lost_frames=lost_frames,
         unmatched_frames=run.unmatched_frames,
     )
     final, parameters = choice.estimate, choice.parameters
@@ -178,7 +179,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         magnification_trace=[None if s is None or pitch_um is None else s * pitch_um for s in scales],
         zoom_change=None if outdated else zoom_change(run.estimates),
         frames=len(run.estimates),
-        lost_frames=run.lost_frames,
+        lost_frames=lost_frames,
         unmatched_frames=run.unmatched_frames,
         valid_for=ValidFor(
             camera=run.optics.camera,
@@ -242,19 +243,18 @@ def _traces(estimates: Sequence[OpticsEstimate], scales: Trace) -> Traces:
 
 def _notes(run: OpticsRun, choice: Choice) -> list[str]:
     notes = []
-    since = choice.frames_since_change
+    since, seen = choice.frames_since_change, run.estimates[-1].zoom
     if since:
-        frames = "1 frame" if since == 1 else f"{since} frames"
         notes.append(
-            f"The run ended {frames} after the zoom began to change, too few for the new zoom "
+            f"The run ended {_frames(since)} after the zoom began to change, too few for the new zoom "
             f"({choice.why_not_newer}): this is the calibration at zoom {choice.estimate.zoom:.4g}, and the zoom "
-            f"now reads {run.estimates[-1].zoom:.4g}."
+            f"now reads {seen:.4g}."
         )
-    seen = run.estimates[-1].zoom
-    if run.last_zoom is not None and abs(run.last_zoom - seen) > run.settings.zoom_still * abs(seen):
+    elif run.last_zoom is not None and abs(run.last_zoom - seen) > run.settings.zoom_still * abs(seen):
+        lost = " Texture, unlike a square, is not found again once the zoom has changed." if run.lost_frames else ""
         notes.append(
             f"The zoom changed to {run.last_zoom:.4g}, where no frame could be used: this is the calibration at zoom "
-            f"{choice.estimate.zoom:.4g}. Texture is not found again once the zoom has changed."
+            f"{choice.estimate.zoom:.4g}.{lost}"
         )
     if not run.complete:
         notes.append("The run was interrupted; the result holds what had been measured until then.")
@@ -265,9 +265,13 @@ def _notes(run: OpticsRun, choice: Choice) -> list[str]:
         )
     notes += run.past_run.notes()
     if run.lost_frames:
-        notes.append(f"The target was not found in {run.lost_frames} frames.")
+        notes.append(f"The target was not found in {_frames(run.lost_frames)}.")
     if run.unmatched_frames:
-        notes.append(f"{run.unmatched_frames} frames had no pose close enough before and after them.")
+        notes.append(f"{_frames(run.unmatched_frames)} had no pose close enough before and after.")
     if run.optics.pixel_pitch_um is None:
         notes.append("The pixel pitch is not known, so no magnification is given; the scale is complete without it.")
     return notes
+
+
+def _frames(number: int) -> str:
+    return "1 frame" if number == 1 else f"{number} frames"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.errors import UnsupportedError
-from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
+from microdrivers.core.samples import Frame, Sample, XYThetaSample, ZoomSample
 from microdrivers.estimators.optics.calibrator import PointTracker
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
@@ -15,6 +16,13 @@ from microdrivers.routines.optics.source import BEGIN, DONE, HOST, Optics, Sourc
 from microdrivers.routines.optics.targets import make_tracker
 from microdrivers.routines.past_run import PastRun, past_run
 from microdrivers.routines.progress import Progress
+
+
+class _Before(NamedTuple):
+    """The number of the frame before, and how many samples were missing up to it."""
+
+    seq: int
+    missing: int
 
 
 class OpticsReplay:
@@ -34,19 +42,22 @@ class OpticsReplay:
         notes = notes_of(recording)
         self._beginning = _beginning(recording, notes)
         self._done = [note for note in notes if note.kind == DONE and note.order > self._beginning.order]
-        self._missing = 0
         taken: int | None = self._beginning.content["frames_expected"]
         self._frames_expected = frames if taken is None else frames_taken(frames, taken, source=str(recording.file))
         self.names = SourceNames(**self._beginning.content["names"])
         self._frames: list[Frame] = []
+        self._replay = Replay(recording, self.bus, admit=self._admit)
+        self._before: _Before | None = None
+        self._frames_told = self._lost_frames = 0
 
     def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
         """Publish the whole recording."""
         noted = self._beginning.content
         progress.step(f"replaying {self._recording.file}")
         tracker = make_tracker(noted["target"], near_px=tuple(noted["near_px"]))
-        replay = Replay(self._recording, self.bus)
-        subscription = self.bus.topic(self.names.camera, Frame, history=FRAME_HISTORY).subscribe(self._keep)
+        replay = self._replay
+        camera = self.bus.topic(self.names.camera, Frame, history=FRAME_HISTORY)
+        subscription = camera.subscribe(self._keep)
         replay.up_to(self._beginning.order)
         subscription.cancel()
         first = [frame for frame in self._frames if frame.seq == noted["first_frame"]]
@@ -57,18 +68,36 @@ class OpticsReplay:
             )
         tracker.update(first[-1])
         self._frames.clear()
+        self._before = _Before(seq=camera.history[-1].seq, missing=0)
         begin(tracker)
         replay.as_arrived(HOST, (self.names.stage, self.names.zoom, self.names.camera), None)
-        self._missing = replay.missing
         if replay.missing:
-            progress.step(f"{replay.missing} samples that the estimator had are not in the recording")
+            progress.step(f"missing in the recording, of the samples that the estimator had: {replay.missing}")
         replay.require(self.bus.topic(self.names.stage, XYThetaSample), self.bus.topic(self.names.zoom, ZoomSample))
 
     @property
     def past_run(self) -> PastRun:
         """What the recording says of it."""
         cut = "" if self._recording.complete else "the recording was cut off, and does not tell the run's end"
-        return past_run(self._recording, self._done, missing=self._missing, broken_off=cut)
+        return past_run(
+            self._recording, self._done, missing=self._replay.missing, broken_off=cut, lost_frames=self._lost_frames
+        )
+
+    def _admit(self, topic: str, sample: Sample) -> bool:
+        """Count the run's frames, and those that the recording lacks; no later one takes the place of a lost one."""
+        if topic != self.names.camera or self._before is None:
+            return True
+        # A number that is skipped may be of a frame that the camera lost in the run: then no sample is missing either.
+        missing = self._replay.missing
+        lost = max(0, min(sample.seq - self._before.seq - 1, missing - self._before.missing))
+        if self._frames_expected is not None:
+            lost = min(lost, self._frames_expected - self._frames_told)
+        self._before = _Before(sample.seq, missing)
+        self._lost_frames += lost
+        self._frames_told += lost
+        is_later = self._frames_told == self._frames_expected
+        self._frames_told += not is_later
+        return not (is_later and self._lost_frames)
 
     def _keep(self, frame: Frame) -> None:
         if frame.seq == self._beginning.content["first_frame"]:
@@ -86,6 +115,12 @@ class OpticsReplay:
 
 def _beginning(recording: Recording, notes: Sequence[Note]) -> Note:
     beginnings = [note for note in notes if note.kind == BEGIN]
+    if not beginnings and recording.losses and (HOST in recording.arrivals or any(n.kind == DONE for n in notes)):
+        raise UnsupportedError(
+            f"{recording.file} holds an optical calibration, and the note of its beginning is in what is damaged or "
+            "lost of the file: without it the calibration cannot be estimated anew",
+            remedy="give another copy of the file; `microdrivers export` gives what is intact of its samples",
+        )
     if not beginnings:
         raise UnsupportedError(
             f"{recording.file} holds no optical calibration",

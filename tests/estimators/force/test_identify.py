@@ -114,7 +114,25 @@ def test_a_shallow_press_on_a_viscoelastic_specimen_is_no_slip(depth_um, seed):
     assert found.misfit.found
     assert not any(found.protocols[found.best].identifiable[name] for name in ("k1", "k2", "b"))
     assert not found.slip.identifiable
+    assert found.slip.reason.count("the surface came back by") == 1
+
+
+def test_a_slip_that_is_refused_though_it_fits_better_is_refused_for_what_it_is():
+    found = identify(recorded(Specimen(4.5, 1e-4, 27.0, 10.0), Push(rest_s=2.0)))
+    assert found.protocols["slip_corrected"].error_percent < 0.1 * found.protocols["single"].error_percent
+    assert found.best == "single"
     assert "the surface came back by" in found.slip.reason
+    assert "as well or better" not in found.slip.reason
+
+
+def test_a_slip_that_is_only_imprecise_is_preferred_where_nothing_else_explains_the_record():
+    push, noise = Push(depth_um=30.0, speed_um_s=20.0, hold_s=3.0), Noise(deformation_um=0.2, force_uN=0.5)
+    found = identify(recorded("slip_corrected", push, noise))
+    assert found.best == "slip_corrected"
+    assert found.protocols["slip_corrected"].imprecise == {"slip_rate", "k2"}
+    assert found.protocols["slip_corrected"].k1_uN_per_um == pytest.approx(5.8781, rel=0.02)
+    assert not found.slip.identifiable
+    assert found.slip.reason.startswith("α in 1/s: 95 % interval ")
 
 
 def test_the_protocols_are_those_of_the_paper():
@@ -364,3 +382,35 @@ def test_a_tip_that_leaves_soon_after_it_turned_back_gives_the_loading_alone(dep
     if "single" not in found.protocols:
         assert found.best == "loading"
         assert any("only the loading is fitted" in note for note in found.notes)
+
+
+def test_what_was_pressed_at_the_reversal_is_within_the_range():
+    record, fit = recorded("single"), identified("single").protocols["single"]
+    assert fit.deepest_um == pytest.approx(np.max(record.deformation_um) - fit.contact_um, abs=0.01)
+    # A single frame that was tracked wrong was not pressed.
+    begun = part(record, 0.0, 10.0)
+    deformation = begun.deformation_um.copy()
+    deformation[200] += 100.0
+    spoilt = identify(begun._replace(deformation_um=deformation)).protocols["loading"]
+    assert spoilt.deepest_um == pytest.approx(np.max(begun.deformation_um), abs=1.0)
+
+
+def test_a_way_back_that_is_too_short_tells_no_speed():
+    found = identify(recorded("single", Push(back_um_s=28.0)))
+    assert len(found.branches.unloading)
+    fit = found.protocols["loading"]
+    assert fit.fastest_unloading_um_s == fit.fastest_um_s == pytest.approx(5.0, abs=0.3)
+
+
+def test_a_tip_that_leaves_as_it_turns_back_has_not_left_while_it_pressed():
+    found = identify(recorded("single", Push(back_um_s=50.0)))
+    assert not any("still grew" in note for note in found.notes)
+    assert any("once the tip had turned" in note for note in found.notes)
+
+
+def test_a_zero_of_the_sensor_is_taken_off_and_told():
+    record = recorded("single")
+    found = identify(record._replace(force_uN=record.force_uN + 20.0))
+    assert found.baseline_uN == pytest.approx(np.full(len(record.time_s), 20.0), abs=0.1)
+    assert any(note.startswith("the force is 20 µN out of contact") for note in found.notes)
+    assert not any("out of contact" in note for note in identified("single").notes)

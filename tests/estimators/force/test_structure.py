@@ -44,7 +44,7 @@ def test_a_slow_residual_is_a_misfit():
     assert found.p_value < 1e-6
     assert found.found_by == "order"
     assert "misfit" in found.text
-    assert "p < 1e-09 of its order)" in found.text
+    assert "p < 1e-09)" in found.text
 
 
 def test_structure_far_below_the_noise_is_said_but_is_no_misfit():

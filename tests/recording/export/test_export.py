@@ -129,6 +129,26 @@ def test_images_are_a_sequence_again(optics_recording, tmp_path):
         assert np.array_equal(sequence.load(row), frame.image)
 
 
+def test_what_a_damaged_recording_lacks_is_told_beside_what_is_exported(optics_recording, tmp_path):
+    file = tmp_path / "run.mcap"
+    data = bytearray(optics_recording.read_bytes())
+    with Recording(optics_recording) as recording:
+        assert len(list(recording.samples(["camera"]))) == 30
+        place = next(offset for offset, (_, _, seq) in recording._frames.items() if seq == 12)
+        length = next(chunk.length for chunk in recording._scan.chunks if chunk.offset == place)
+    data[place + length - 1] ^= 1
+    file.write_bytes(data)
+    with Recording(file) as recording:
+        for form in ("images", "csv"):
+            report = export_recording(recording, form, tmp_path / "out")
+            assert report.remarks == [f"{tmp_path / 'out' / 'run-flaws.txt'}: what is wrong with the recording"]
+        assert (tmp_path / "out" / "run-flaws.txt").read_text().splitlines() == recording.flaws
+    with (tmp_path / "out" / "camera" / "frames.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["seq"] for row in rows if row["missing_before"] != "0"] == ["13"]
+    assert rows[12]["missing_before"] == "1"
+
+
 def test_a_video_shows_what_was_recorded(optics_recording, tmp_path):
     with Recording(optics_recording) as recording:
         export_recording(recording, "video", tmp_path)

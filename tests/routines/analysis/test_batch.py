@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
 from pathlib import Path
@@ -182,3 +183,31 @@ def test_a_recording_to_which_links_lead_is_analysed_once(tmp_path, monkeypatch)
     named = [Path("runs"), tmp_path / "runs", Path("runs/monday/back/monday/b.mcap"), Path("runs/monday/back")]
     assert find_recordings(named) == [str(runs / "a.mcap")]
     assert find_recordings(named[:1]) == ["runs/monday/a.mcap"]
+
+
+def test_links_to_folders_are_followed_and_one_that_leads_nowhere_has_a_row(in_process, tmp_path):
+    runs, elsewhere = tmp_path / "runs", tmp_path / "elsewhere"
+    for folder in (runs / "z", elsewhere):
+        folder.mkdir(parents=True)
+        (folder / "run.mcap").write_bytes(b"")
+    (runs / "a").symlink_to("z")
+    (runs / "linked").symlink_to("../elsewhere")
+    (elsewhere / "back").symlink_to("../runs")
+    (runs / "gone.mcap").symlink_to("nowhere.mcap")
+    found = find_recordings([runs])
+    assert found == [str(runs / name) for name in ("gone.mcap", "linked/run.mcap", "z/run.mcap")]
+    report = analyse_recordings(found, tmp_path / "t.csv")
+    assert "cannot be read: No such file" in report.rows[0]["error"]
+
+
+def test_a_table_on_a_full_disk_is_refused_and_leaves_no_journal(in_process, files, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size, told in ((100, "cannot be written: File too large"), (3000, "cannot be written: File too large")):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            with pytest.raises(ConfigError, match=told):
+                analyse_recordings(files, tmp_path / "t.csv", analyse=fake_row)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert (tmp_path / "t.csv.journal").exists() == (size == 3000)  # which has rows
+    assert analyse_recordings(files, tmp_path / "t.csv", analyse=fake_row).resumed > 0
