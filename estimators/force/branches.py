@@ -98,9 +98,9 @@ def find_branches(
     hold_end = int(np.searchsorted(time_s, turns[-1])) if turns else n
     if len(turns) == 1 and _holds(time_s, deformation_um, first, load_end):
         hold_end = n
-    going, gone = _loss(force_uN, first, hold_end, force_sigma_uN)
+    going, gone = _loss(time_s, force_uN, first, hold_end, force_sigma_uN)
     if gone == hold_end < n:
-        slipping, slipped_off = _loss(force_uN, first, first, force_sigma_uN)
+        slipping, slipped_off = _loss(time_s, force_uN, first, first, force_sigma_uN)
         if slipped_off < hold_end:
             going, gone = slipping, slipped_off
             hold_end, load_end = min(hold_end, gone), min(load_end, gone)
@@ -130,9 +130,14 @@ def _onset(time_s: Array, force: Array, sigma: float) -> Departure:
     first = found.early
     top = int(np.argmax(force))
     growth = (force[top] - force[first]) / (time_s[top] - time_s[first]) if top > first else 0.0
-    at_rest = np.polynomial.polynomial.polyfit(time_s[:first], force[:first], 1)[1]
-    by_noise = sigma / float(np.std(time_s[:first]) * np.sqrt(first))
-    return Departure(0, 0) if at_rest > max(_STARTS_IN_CONTACT * growth, _CLEAR_SLOPE * by_noise) else found
+    return Departure(0, 0) if _is_loaded(time_s[:first], force[:first], growth, sigma) else found
+
+
+def _is_loaded(time_s: Array, force: Array, growth_uN_s: float, sigma: float) -> bool:
+    """Whether a force that should be at rest grows as one in contact does."""
+    slope = float(np.polynomial.polynomial.polyfit(time_s, force, 1)[1])
+    by_noise = sigma / float(np.std(time_s) * np.sqrt(len(time_s)))
+    return slope > max(_STARTS_IN_CONTACT * growth_uN_s, _CLEAR_SLOPE * by_noise)
 
 
 def _speeds(time_s: Array, deformation: Array, usual_um_s: float, sigma: float) -> Array:
@@ -202,7 +207,7 @@ def _holds(time_s: Array, deformation: Array, first: int, turn: int) -> bool:
                 and deformation[-3:].mean() > deformation[turn - 1] - 0.1 * depth)  # fmt: skip
 
 
-def _loss(force: Array, first: int, begin: int, sigma: float) -> tuple[int, int]:
+def _loss(time_s: Array, force: Array, first: int, begin: int, sigma: float) -> tuple[int, int]:
     """First and last sample that may be the first at the baseline again, however that drifts; their number if none."""
     n = len(force)
     tail = force[-_FEWEST_AT_REST:]
@@ -213,4 +218,12 @@ def _loss(force: Array, first: int, begin: int, sigma: float) -> tuple[int, int]
         gone = gone if n - gone >= _SHORTEST_LOSS else n
         return gone, gone
     found = find_departure(force[begin:][::-1], sigma)
-    return (begin, begin) if found is None else (n - found.late, n - found.early)
+    if found is None:
+        # The median: around the reversal some frames may still have felt the specimen.
+        fallen_uN = np.median(force[begin : begin + _FEWEST_AT_REST]) - np.mean(tail)
+        return (n, n) if fallen_uN > CLEAR * sigma else (begin, begin)
+    going, gone = n - found.late, n - found.early
+    fall = (force[begin] - force[gone - 1]) / (time_s[gone - 1] - time_s[begin]) if gone - 1 > begin else 0.0
+    if _is_loaded(-time_s[gone:][::-1], force[gone:][::-1], fall, sigma):
+        return n, n
+    return going, gone

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -27,6 +30,12 @@ from microdrivers.estimators.force.record import IndentationRecord, Mask, check
 from microdrivers.estimators.force.ridge import ridge_fit
 from microdrivers.estimators.force.selection import all_protocols, settled
 from microdrivers.estimators.force.structure import StructureTest, structure_test
+
+_AS_LIKELY = 10.0
+"""Difference of −2·log-likelihood between two explanations that a record cannot tell apart for sure."""
+
+_APART = 3.0
+"""Standard deviations of a difference that is none of noise."""
 
 _SIMPLER = 1.1
 """Of the smallest error: what a protocol with fewer parameters may have and still be preferred."""
@@ -135,6 +144,7 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     fits = all_protocols(prepared, on_ramps)
     both_ways = "single" in fits
     protocols = {name: _protocol_fit(prepared, name, fit, both_ways=both_ways) for name, fit in fits.items()}
+    protocols = _rivals_marked(protocols)
     best = _best(protocols)
     slip = _slip(prepared, protocols, best)
     notes = notes_on(record, prepared, both_ways=both_ways)
@@ -270,6 +280,24 @@ def _at_all_samples(prepared: Prepared, fit: Fit, motion: Motion) -> Array:
     for part in (prepared.branches.approach, prepared.branches.lost):
         force[part.start : part.stop] = fit.theta[BASE]
     return force + prepared.baseline_uN
+
+
+def _rivals_marked(protocols: Mapping[ProtocolName, ProtocolFit]) -> dict[ProtocolName, ProtocolFit]:
+    """The protocols; what two that explain the record about as well do not agree on is not determined."""
+    within = [fit for fit in protocols.values() if fit.within_noise and fit.name not in ("loading", "loading_only")]
+    marked = dict(protocols)
+    for one, other in itertools.permutations(within, 2):
+        if abs(one.likelihood_cost - other.likelihood_cost) > _AS_LIKELY:
+            continue
+        weak = dict(marked[one.name].weak)
+        for name, (mine, my_sigma) in one.springs_and_damper.items():
+            its, its_sigma = other.springs_and_damper[name]
+            if abs(mine - its) > _APART * math.hypot(my_sigma, its_sigma):
+                why = f"{other.name} explains the record as well with {its:.3g}"
+                weak[name] = f"{weak[name]}; {why}" if name in weak else why
+        identifiable = {name: name not in weak for name in one.identifiable}
+        marked[one.name] = dataclasses.replace(marked[one.name], weak=weak, identifiable=identifiable)
+    return marked
 
 
 def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:

@@ -105,6 +105,15 @@ class ProtocolFit:
     fastest_unloading_um_s: float
     likelihood_cost: float
 
+    @property
+    def springs_and_damper(self) -> dict[str, tuple[float, float]]:
+        """k1, k2 and b of the loading, each with its standard deviation, by the names of `identifiable`."""
+        return {
+            "k1": (self.k1_uN_per_um, self.sigma_k1_uN_per_um),
+            "k2": (self.k2_uN_per_um3, self.sigma_k2_uN_per_um3),
+            "b": (self.b_loading_uN_s_per_um, self.sigma_b_uN_s_per_um),
+        }
+
     def model(self) -> SpecimenModel:
         """What reading force from the camera needs."""
         return SpecimenModel(

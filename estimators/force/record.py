@@ -205,7 +205,8 @@ def _check_force(record: IndentationRecord, unseen: Mask) -> None:
             f"no contact: the force varies by {np.ptp(smooth):.3g} µN over the whole travel, noise is {noise:.3g} µN",
             remedy="check that the probe reaches the specimen, the height and aim of the probe, and the sensor",
         )
-    if smooth.max() - smooth[0] < smooth[0] - smooth.min() and not _starts_deep(record, unseen):
+    pulls = smooth.max() - smooth[0] < smooth[0] - smooth.min() and smooth.min() < -CLEAR * noise
+    if pulls and not _starts_deep(record, unseen):
         raise DataError(
             f"the specimen pulls: the force goes from {smooth[0]:.4g} down to {smooth.min():.4g} µN",
             remedy="forces are positive while the probe is pressed: change the sign of force_uN, or turn the sensor's "

@@ -73,6 +73,24 @@ def test_a_record_that_begins_or_ends_in_contact():
     assert len(held.unloading) == 0
 
 
+@pytest.mark.parametrize("sigma_uN", [0.5, 2.0])
+@pytest.mark.parametrize("preset", ["single", "unloading_springs"])
+def test_a_noisy_record_that_ends_in_contact(preset, sigma_uN):
+    record = part(recorded(preset, noise=Noise(force_uN=sigma_uN)), 0.0, 34.0)
+    found = find_branches(
+        record.time_s, record.deformation_um, record.force_uN, deformation_sigma_um=0.06, force_sigma_uN=sigma_uN
+    )
+    assert found.release_s is None
+    assert len(found.unloading) > 100
+
+
+def test_a_tip_that_leaves_at_the_reversal():
+    record = recorded("single", Push(depth_um=20.0))
+    found = branches_of(record)
+    assert len(found.lost) > 50
+    assert len(found.unloading) <= 2
+
+
 def test_a_drifting_baseline_is_no_contact():
     found = branches_of(recorded("single", noise=Noise(drift_uN_per_s=0.05)))
     still = branches_of(recorded("single"))

@@ -73,6 +73,21 @@ def test_a_noisy_or_drifting_sensor_widens_intervals_and_moves_nothing(preset, n
     assert not any("adhesion" in note or "contact was lost" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_two_protocols_explain_alike_is_not_determined(seed):
+    """Where the contact is not seen, half the damper both ways explains what the whole one does on the way in alone."""
+    specimen, push = Specimen(30.0, 1e-4, 5.0, 0.0), Push(depth_um=50.0, speed_um_s=7.0)
+    record = part(
+        recorded(specimen, push, Noise(force_uN=0.1), seed=seed), indented(specimen, push).contact_s + 0.4, 99.0
+    )
+    found = identify(record)
+    assert found.best in ("single", "unloading_springs")
+    for name, rival, other_b in (("single", "unloading_springs", "5.0"), ("unloading_springs", "single", "2.5")):
+        assert not found.protocols[name].identifiable["b"]
+        assert f"{rival} explains the record as well with {other_b}" in found.protocols[name].weak["b"]
+        assert found.protocols[name].identifiable["k1"]
+
+
 def test_slip_is_estimated_together_with_the_rest():
     found = identified("slip_corrected")
     assert found.slip is not None

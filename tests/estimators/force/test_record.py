@@ -157,3 +157,10 @@ def test_noise_of_rounded_values_is_that_of_the_rounding():
     force = 5.0 * np.round(np.linspace(0.0, 600.0, 900) / 5.0)
     assert white_sigma(force) == pytest.approx(5.0 / np.sqrt(12.0))
     assert white_sigma(np.linspace(0.0, 600.0, 900)) < 1e-9
+
+
+def test_a_record_that_begins_deep_and_ends_free_pulls_nowhere():
+    record = recorded("unloading_springs")
+    turn = int(np.argmax(record.deformation_um))
+    begins = turn - int(0.45 * turn)
+    check(part(record, float(record.time_s[begins]), 99.0))
