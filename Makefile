@@ -31,8 +31,9 @@ demo: $(READY)
 	$(BIN)/microdrivers calibrate optics --seed $(SEED) --out $(OUT)
 
 # Bytecode is kept whatever the environment says: pytest rewrites every assertion, a twentieth of the time.
+# Three processes for two cores: the one with the tests in real time mostly sleeps, and goes first (tests/conftest.py).
 test: $(READY)
-	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(PYTEST_ARGS)
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -n 3 --dist loadgroup $(PYTEST_ARGS)
 
 # What needs the machine to itself, in real time and one after the other: tools behind a serial CAN adapter and on
 # Modbus, independent Modbus masters, routines on a served rig. ON=guest runs it where nothing is late because the
