@@ -14,7 +14,7 @@ NO_SKIPS = bool({"MICRODRIVERS_NO_SKIPS", "VCAN_RUN"} & os.environ.keys())
 """Whether a test that is skipped has failed: in `.ci/run`, and in a guest, where all is there that tests need."""
 
 
-_STEPS_BACK = 10
+_STEPS_BACK = 5
 """Of a process' priority, in which 0 is usual and 19 the least."""
 
 
