@@ -31,7 +31,7 @@ _SHORTEST_LOSS = 3
 _STARTS_IN_CONTACT = 0.05
 """Growth of the force before the contact, relative to that while loading, which is more than a sensor's drift."""
 
-_CLEAR_SLOPE = 4.0
+CLEAR_SLOPE = 4.0
 """Standard deviations of a slope that are no noise."""
 
 
@@ -137,7 +137,7 @@ def _is_loaded(time_s: Array, force: Array, growth_uN_s: float, sigma: float) ->
     """Whether a force that should be at rest grows as one in contact does."""
     slope = float(np.polynomial.polynomial.polyfit(time_s, force, 1)[1])
     by_noise = sigma / float(np.std(time_s) * np.sqrt(len(time_s)))
-    return slope > max(_STARTS_IN_CONTACT * growth_uN_s, _CLEAR_SLOPE * by_noise)
+    return slope > max(_STARTS_IN_CONTACT * growth_uN_s, CLEAR_SLOPE * by_noise)
 
 
 def _speeds(time_s: Array, deformation: Array, usual_um_s: float, sigma: float) -> Array:

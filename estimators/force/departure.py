@@ -88,10 +88,12 @@ def _until_clear(force: Array, sigma: float, noticed: int) -> slice:
 def _most_likely(force: Array, sigma: float) -> Departure | None:
     """Where a constant and, from there on, a straight line of any height explain a force about as well as anywhere.
 
-    None if one straight line explains it as well.
+    None if one straight line explains it as well, or there are too few samples to tell.
     """
     values = force - force.mean()
     splits = np.arange(_FEWEST, len(values) - _FEWEST_RISING + 1)
+    if not len(splits):
+        return None
     misfit = np.array([_constant_misfit(values[:at]) + _line_misfit(values[at:]) for at in splits])
     as_well = misfit.min() + _LIKELY * max(sigma**2, misfit.min() / len(values))
     if _line_misfit(values) < as_well:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from microdrivers.core.errors import DataError, SaturatedData
-from microdrivers.estimators.force.branches import Branches, find_branches
+from microdrivers.estimators.force.branches import CLEAR_SLOPE, Branches, find_branches
 from microdrivers.estimators.force.joint import BASE, CONTACT, CONTACT_S, PARAMETERS, Prior
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.record import IndentationRecord, lost, saturated, white_sigma
@@ -30,7 +30,6 @@ _LARGEST_SHARE = 0.2
 _MOVES = 0.5
 """Of the loading speed: what moves at that before the contact is the tool, not the specimen."""
 _SHORTEST_HOLD_S = 1.0
-_CLEAR_SLOPE = 4.0
 _TIP_SAMPLES = 30
 """Before the contact, that tell whether the deformation follows the tool and how."""
 
@@ -248,7 +247,7 @@ def _baseline(
     if min(len(before), len(after)) >= _SHORTEST_BASELINE:
         t = time_s[rest] - time_s[rest].mean()
         slope, slope_sigma = float(t @ force[rest] / (t @ t)), sigma / float(np.sqrt(t @ t))
-        if abs(slope) > _CLEAR_SLOPE * slope_sigma:
+        if abs(slope) > CLEAR_SLOPE * slope_sigma:
             return level + slope * (time_s - time_s[rest].mean()), sigma / float(np.sqrt(len(rest)))
     return np.full_like(time_s, level), sigma / float(np.sqrt(len(rest)))
 
@@ -287,7 +286,7 @@ def _contact(
     if abs(slope) > _MOVES * usual:
         return ContactKnowledge("tip", level, contact_s, sigma, sigma_s, slope)
     level, sigma, slope, slope_sigma = _line(time_s, deformation, 0, stop, contact_s, sigma_x)
-    if abs(slope) < _CLEAR_SLOPE * slope_sigma:
+    if abs(slope) < CLEAR_SLOPE * slope_sigma:
         level, sigma = float(np.mean(deformation[:stop])), sigma_x / float(np.sqrt(stop))
     # Otherwise the specimen creeps before it is touched: where it was at the contact counts.
     return ContactKnowledge("surface", level, contact_s, sigma, sigma_s, 0.0)

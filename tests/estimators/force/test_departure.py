@@ -45,3 +45,8 @@ def test_noise_leaves_no_baseline(seed):
 
 def test_a_slow_drift_of_a_quiet_sensor_leaves_no_baseline():
     assert find_departure(force(0.0, 0.0, 0.05, drift_uN=0.05 / 30.0), 0.05) is None
+
+
+@pytest.mark.parametrize("length", range(9, 20))
+def test_a_slow_rise_in_a_few_samples_is_no_error(length):
+    assert find_departure(force(0.0, 4.8, 0.0, at=0, length=length), 3.0) is None
