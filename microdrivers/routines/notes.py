@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
+from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.samples import RoutineNote
 
 TOPIC = "routine"
+INTERRUPTED = "it was interrupted"
+
+
+class Ending:
+    """How an experiment ended; `ended_by` is empty if it went to its end."""
+
+    ended_by: str = "an error of the program"
 
 
 def note(bus: Bus, clock: Clock, kind: str, content: Mapping[str, Any]) -> None:
@@ -23,3 +32,27 @@ def note(bus: Bus, clock: Clock, kind: str, content: Mapping[str, Any]) -> None:
             content=json.dumps(content, allow_nan=False),
         )
     )  # fmt: skip
+
+
+@contextmanager
+def noted_ending(bus: Bus, clock: Clock, kind: str, *, finish: Callable[[], object]) -> Iterator[Ending]:
+    """Run an experiment, finish it, and note how it ended: Ctrl-C ends it and goes no farther, errors go on.
+
+    Args:
+        bus: of the run.
+        clock: of the run.
+        kind: of the note.
+        finish: called before the note, however it ended; what it raises goes on, a second Ctrl-C too.
+    """
+    ending = Ending()
+    try:
+        yield ending
+        ending.ended_by = ""
+    except KeyboardInterrupt:
+        ending.ended_by = INTERRUPTED
+    except MicrodriversError as error:
+        ending.ended_by = error.what
+        raise
+    finally:
+        finish()
+        note(bus, clock, kind, {"ended_by": ending.ended_by})

@@ -8,8 +8,6 @@ from typing import NamedTuple
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import Note
 
-INTERRUPTED = "it was interrupted"
-
 _MOST_FLAWS = 8
 
 

@@ -26,8 +26,8 @@ from microdrivers.estimators.force.vision_force import VisionForce
 from microdrivers.estimators.vision.image_drift import ImageDrift
 from microdrivers.routines.force.frames import all_frames, drift_of, in_contact_uN, record_of, without_drift
 from microdrivers.routines.force.source import DONE, FrameTracker, IndentationSetup, IndentationSource, host_name
-from microdrivers.routines.notes import note
-from microdrivers.routines.past_run import INTERRUPTED, PastRun
+from microdrivers.routines.notes import noted_ending
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
 
@@ -107,23 +107,15 @@ class Characterisation:
             NoContact, IllConditioned and other DataError or CalibrationError: the record does not show or determine
                 a specimen. MicrodriversError: whatever the source raises. See `partial` for what is left then.
         """
-        ended_by = "an error of the program"
-        try:
-            self._experiment(progress or SilentProgress(), check=check)
-        except KeyboardInterrupt:
-            self.interrupted = True
-            ended_by = INTERRUPTED
-        except MicrodriversError as error:
-            ended_by = error.what
-            raise
-        else:
-            ended_by = ""
-        finally:
-            self._source.finish()
-            note(self._source.bus, self._source.clock, DONE, {"ended_by": ended_by})
+        with noted_ending(self._source.bus, self._source.clock, DONE, finish=self._source.finish) as ending:
+            try:
+                self._experiment(progress or SilentProgress(), check=check)
+            except KeyboardInterrupt:
+                self.interrupted = True
+                raise
         if self.first is None:
             raise NoContact("interrupted before anything was measured", remedy="start again")
-        return self._found(ended_by or self._source.past_run.ended_by)
+        return self._found(ending.ended_by or self._source.past_run.ended_by)
 
     def partial(self, error: MicrodriversError) -> ForceRun | None:
         """What had been measured before `run` ended with this error, identified; None if that tells nothing."""

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.inbox import EstimatorHost, Inbox
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
 from microdrivers.core.units import NS_PER_S
@@ -23,10 +22,10 @@ from microdrivers.results.optics import (
     iterations_to_settle,
 )
 from microdrivers.results.record import Provenance, Trace
-from microdrivers.routines.notes import note
+from microdrivers.routines.notes import noted_ending
 from microdrivers.routines.optics.choice import Choice, begins_change, choose_estimate
 from microdrivers.routines.optics.source import DONE, HOST, Optics, OpticsSource
-from microdrivers.routines.past_run import INTERRUPTED, PastRun
+from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
 
@@ -107,21 +106,14 @@ def calibrate_optics(
         )
         on_host(HOST, hosts[-1].inbox)
 
-    ended_by = "an error of the program"
-    try:
-        source.run(begin, progress or SilentProgress())
-    except KeyboardInterrupt:
-        ended_by = INTERRUPTED
-    except MicrodriversError as error:
-        ended_by = error.what
-        raise
-    else:
-        ended_by = ""
-    finally:
+    def finish() -> None:
         for host in hosts:
             host.close()
         subscription.cancel()
-        note(bus, source.clock, DONE, {"ended_by": ended_by})
+
+    with noted_ending(bus, source.clock, DONE, finish=finish) as ending:
+        source.run(begin, progress or SilentProgress())
+    ended_by = ending.ended_by
     if ended_by:
         newest_zoom = zoom.latest
     return OpticsRun(
