@@ -124,11 +124,10 @@ class BulkSlcan(can.BusABC):
 
     def _count_refusals(self, data: bytes) -> None:
         """Adapters also refuse to close what is closed, and the empty command: python-can begins with both."""
-        if _TAKEN in data:  # it is open, and has taken a frame
-            self._unanswered = 0
-        count = data.count(_BELL)
-        self._counters.refused += max(0, count - self._unanswered)
-        self._unanswered = max(0, self._unanswered - count)
+        opening, taken, running = data.partition(_TAKEN) if self._unanswered else (b"", _TAKEN, data)
+        count = opening.count(_BELL)
+        self._counters.refused += max(0, count - self._unanswered) + running.count(_BELL)
+        self._unanswered = 0 if taken else max(0, self._unanswered - count)  # it is open, and has taken a frame
 
     def _write_rest(self, rest: bytes) -> None:
         """Wait for room; what has no room in time is given up, so that it is not sent at another time."""

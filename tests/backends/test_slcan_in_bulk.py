@@ -1,7 +1,11 @@
 """A serial CAN adapter read and written in bulk, on a pseudo-terminal whose other end the test holds."""
 
+import fcntl
 import os
 import select
+import sys
+import termios
+import time
 import tty
 
 import can
@@ -42,7 +46,16 @@ class Bench:
         return data
 
     def say(self, data):
+        """Write, and wait until it has come through: the kernel hands it over in its own time."""
+        unread = self.unread()
         assert os.write(self.end, data) == len(data)
+        deadline = time.monotonic() + 5.0
+        while self.unread() < unread + len(data):
+            assert time.monotonic() < deadline, "the terminal keeps what was said"
+            time.sleep(0.0005)
+
+    def unread(self):
+        return int.from_bytes(fcntl.ioctl(self.adapter._bus.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
 
     def received(self, count):
         return [self.adapter.receive(1.0) for _ in range(count)]
@@ -158,6 +171,12 @@ def test_frames_that_the_adapter_refuses_are_counted_and_told(bench):
     bench.adapter.receive(0.0)
     assert bench.counters.refused == 3
     assert "the adapter has refused 3 frames" in bench.counters.hint()
+
+
+def test_what_it_says_to_being_opened_is_no_refusal_also_if_it_comes_with_the_first_answers(bench):
+    bench.say(b"\r\a\a\r\rz\rz\r\az\r")
+    bench.adapter.receive(0.0)
+    assert bench.counters.refused == 1
 
 
 def test_an_adapter_that_is_pulled_is_lost(bench):
