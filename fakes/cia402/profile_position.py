@@ -161,7 +161,7 @@ class ProfilePosition:
         return bits
 
     def reached_at(self, t_ns: int) -> bool:
-        """Whether the target was reached; while halted, whether the table stands."""
+        """Whether the target was reached; while halted, whether the profile has ended: the table lags behind it."""
         if self._halted:
             return not self._motion.moving_at(t_ns)
         if self._given_up:

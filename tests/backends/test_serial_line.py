@@ -15,6 +15,7 @@ from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.errors import LinkLost, LinkTimeout, UnsupportedError
 from microdrivers.core.samples import WireTraffic
 from microdrivers.devices.wire_tap import WireTap
+from tests.arrival import wait_for_unread
 
 # One after the other: they run in real time.
 pytestmark = pytest.mark.xdist_group("real_time")
@@ -97,7 +98,7 @@ def test_what_nobody_asked_for_is_not_taken_for_a_reply(far, line):
     far.replies = [b"first\n", b"second\n"]
     assert line.exchange(b"?", whole).reply == b"first\n"
     far.write(b"3=spontaneous \nand more than one byte of it\n")
-    line.clock.sleep(0.02)
+    wait_for_unread(line._port._descriptor, 44)
     assert line.exchange(b"?", whole).reply == b"second\n"
     assert line.counters.discarded_bytes == 44
 
@@ -107,6 +108,7 @@ def test_the_rest_of_half_a_reply_is_not_taken_for_the_next_one(far, line):
     with pytest.raises(LinkTimeout, match="only a part of the reply to b'\\?' came"):
         line.exchange(b"?", whole)
     far.write(b" a reply\n")
+    wait_for_unread(line._port._descriptor, 9)
     assert line.exchange(b"?", whole).reply == b"next\n"
 
 

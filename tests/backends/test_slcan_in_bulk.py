@@ -1,11 +1,7 @@
 """A serial CAN adapter read and written in bulk, on a pseudo-terminal whose other end the test holds."""
 
-import fcntl
 import os
 import select
-import sys
-import termios
-import time
 import tty
 
 import can
@@ -18,6 +14,7 @@ from microdrivers.backends.lines.settings import CanConnection
 from microdrivers.backends.lines.slcan_in_bulk import BulkSlcan, in_bulk
 from microdrivers.core.clock import SystemClock
 from microdrivers.core.errors import LinkLost, LinkTimeout
+from tests.arrival import unread, wait_for_unread
 
 pytestmark = [pytest.mark.xdist_group("real_time"), pytest.mark.skipif(os.name != "posix", reason="no terminals")]
 
@@ -46,16 +43,10 @@ class Bench:
         return data
 
     def say(self, data):
-        """Write, and wait until it has come through: the kernel hands it over in its own time."""
-        unread = self.unread()
+        descriptor = self.adapter._bus.fileno()
+        before = unread(descriptor)
         assert os.write(self.end, data) == len(data)
-        deadline = time.monotonic() + 5.0
-        while self.unread() < unread + len(data):
-            assert time.monotonic() < deadline, "the terminal keeps what was said"
-            time.sleep(0.0005)
-
-    def unread(self):
-        return int.from_bytes(fcntl.ioctl(self.adapter._bus.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
+        wait_for_unread(descriptor, before + len(data))
 
     def received(self, count):
         return [self.adapter.receive(1.0) for _ in range(count)]
