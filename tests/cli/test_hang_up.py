@@ -1,5 +1,6 @@
 """A closed terminal ends a command as Ctrl-C does."""
 
+import contextlib
 import os
 import pty
 import signal
@@ -26,18 +27,29 @@ def rig_file(tmp_path):
     return file
 
 
+@pytest.fixture(autouse=True)
+def hang_ups_are_not_ignored():
+    """Programs inherit it if they are: the tests may have been started with nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@contextlib.contextmanager
 def served(rig_file, **streams):
     temporary = rig_file.parent / "temporary"
     temporary.mkdir()
     command = [sys.executable, "-m", "microdrivers", "serve", str(rig_file)]
-    return temporary, subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, env=os.environ | {"TMPDIR": str(temporary)}, **streams
-    )
+    environment = os.environ | {"TMPDIR": str(temporary)}
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **streams) as process:
+        try:
+            yield temporary, process
+        finally:
+            process.kill()  # one that has not ended would keep the tests waiting
 
 
 def test_serve_cleans_up_when_it_is_hung_up(rig_file):
-    temporary, process = served(rig_file, stdout=subprocess.PIPE, text=True)
-    with process:
+    with served(rig_file, stdout=subprocess.PIPE, text=True) as (temporary, process):
         for line in process.stdout:
             if line.startswith("serving"):
                 break
@@ -50,9 +62,8 @@ def test_serve_cleans_up_when_it_is_hung_up(rig_file):
 
 def test_a_terminal_that_is_gone_keeps_nothing_from_being_cleaned(rig_file):
     ours, theirs = pty.openpty()
-    temporary, process = served(rig_file, stdout=theirs, stderr=theirs)
-    os.close(theirs)
-    with process:
+    with served(rig_file, stdout=theirs, stderr=theirs) as (temporary, process):
+        os.close(theirs)
         said = b""
         while b"serving" not in said:
             said += os.read(ours, 4096)
