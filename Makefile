@@ -82,6 +82,7 @@ bench: $(READY)
 	$(BIN)/python scripts/bench_tracker.py
 	$(BIN)/python scripts/bench_worlds.py
 	$(BIN)/python scripts/bench_force.py
+	$(BIN)/python scripts/bench_specimen_recursion.py
 	$(BIN)/python scripts/bench_guard.py overshoot
 	$(BIN)/python scripts/bench_wires.py
 	$(BIN)/python scripts/bench_record.py

@@ -6,7 +6,9 @@ Without a name all are measured, in about a minute and a half. `socketcan` is me
 a guest (`scripts/vcan-run --setup auto` fetches it once). See bench_can/ for how.
 """
 
+import sys
+
 from bench_can.cli import main
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -7,6 +7,7 @@ efficiency by. See bench_force/ for how.
 """
 
 import os
+import sys
 
 # The matrices are small: threads of the linear algebra only get in each other's way. Before numpy is loaded.
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -15,4 +16,4 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 from bench_force.cli import main  # noqa: E402
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

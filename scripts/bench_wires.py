@@ -5,7 +5,9 @@
 Without a name all are measured, in about six minutes; `--repeat 0.2` shortens. See bench_wires/ for how.
 """
 
+import sys
+
 from bench_wires.cli import main
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -52,6 +52,7 @@ def run_world(seed: int) -> dict[str, Any]:
     assert known is not None
     change = result.zoom_change
     sigma = np.sqrt(np.diag(np.array(result.covariance)))
+    half_width = student_factor(result.degrees_of_freedom)
     angle_error = (forty_on.angle_deg - known.angle_deg + 180.0) % 360.0 - 180.0
     return {
         "seed": seed,
@@ -60,7 +61,9 @@ def run_world(seed: int) -> dict[str, Any]:
         "moving_frames": change.last_moving_frame - change.first_frame + 1 if change else 0,
         "scale_percent": 100.0 * (forty_on.scale_px_per_um / known.scale_px_per_um - 1.0),
         "angle_deg": angle_error,
-        "covered": np.abs(np.array(known.errors["projection"])) <= student_factor(result.degrees_of_freedom) * sigma,
+        "covered": np.abs(np.array(known.errors["projection"])) <= half_width * sigma,
+        "final_scale_ppm": 1e6 * (result.scale_px_per_um / known.scale_px_per_um - 1.0),
+        "final_scale_half_width_ppm": 1e6 * half_width * result.scale_sigma_px_per_um / result.scale_px_per_um,
         "tilt_covered": result.tilt.interval_deg[0] <= known.tilt_deg <= result.tilt.interval_deg[1],
         "view_right": result.view == known.view,
         "lost": result.lost_frames,
@@ -102,6 +105,12 @@ def main() -> int:
         "95 % intervals of P cover the truth: "
         + ", ".join(f"{n} {100 * c:.1f} %" for n, c in zip(NAMES, covered, strict=True))
     )
+    errors_ppm, half_widths_ppm = (
+        np.array([o[key] for o in good]) for key in ("final_scale_ppm", "final_scale_half_width_ppm")
+    )
+    print(f"that of the magnification in {100 * np.mean(np.abs(errors_ppm) <= half_widths_ppm):.1f} %, mean error "
+          f"{errors_ppm.mean():.1f} ± {errors_ppm.std() / math.sqrt(len(errors_ppm)):.1f} ppm, interval "
+          f"± {half_widths_ppm.mean():.0f} ppm")  # fmt: skip
     print(f"tilt interval covers in {100 * np.mean([o['tilt_covered'] for o in good]):.1f} %; "
           f"view right in {100 * np.mean([o['view_right'] for o in good]):.1f} %; "
           f"frames lost {sum(o['lost'] for o in good)}, unmatched {sum(o['unmatched'] for o in good)}")  # fmt: skip

@@ -7,13 +7,13 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from bench_wires.figures import Figure, measure_in_turn
+from bench_wires.figures import Figure, measure_in_turn, show
 
 from bench_can import exchanges, move, socketcan, streams
 
 
-def main() -> None:
-    """Measure and print."""
+def main() -> int:
+    """Measure and print; exit status 1 if a figure falls short."""
     kinds: dict[str, Callable[[], list[Figure]]] = {
         "move": lambda: move.measure(asked.seeds),
         "streams": lambda: streams.measure(asked.repeat),
@@ -29,3 +29,4 @@ def main() -> None:
     figures = measure_in_turn(kinds, asked.kinds)
     if asked.json:
         asked.json.write_text(json.dumps(figures), encoding="utf-8")
+    return show(figures)

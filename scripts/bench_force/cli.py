@@ -27,8 +27,8 @@ _REAL = TESTS / "data" / "force" / "chiaro_aebp1_30hz.csv"
 Map = Callable[[str, Sequence[int], int, bool], list[Outcome]]
 
 
-def main() -> None:
-    """Print all figures."""
+def main() -> int:
+    """Print all figures; exit status 1 if one falls short."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--share", type=float, default=1.0, help="of the records to run")
     parser.add_argument("--workers", type=int, default=2, help="processes")
@@ -64,8 +64,9 @@ def main() -> None:
             bool(np.median(seconds) <= 1.0),
         )
     )
-    show(figures)
+    status = show(figures)
     print(f"{len(seconds) + 3 * efficiency} identifications in {time.perf_counter() - begun:.0f} s")
+    return status
 
 
 def _preset_figures(

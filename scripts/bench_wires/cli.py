@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Callable
 
 from bench_wires import cables, calibration, frames, pose, status
-from bench_wires.figures import Figure, measure_in_turn
+from bench_wires.figures import Figure, measure_in_turn, show
 
 
-def main() -> None:
-    """Measure and print."""
+def main() -> int:
+    """Measure and print; exit status 1 if a figure falls short."""
     kinds: dict[str, Callable[[], list[Figure]]] = {
         "pose": lambda: pose.measure(asked.repeat),
         "status": lambda: status.measure(asked.repeat),
@@ -23,4 +23,4 @@ def main() -> None:
     parser.add_argument("--repeat", type=float, default=1.0, help="share of the usual number of repetitions")
     parser.add_argument("--seeds", type=int, default=5, help="worlds to calibrate in")
     asked = parser.parse_args()
-    measure_in_turn(kinds, asked.kinds)
+    return show(measure_in_turn(kinds, asked.kinds))

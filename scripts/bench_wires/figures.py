@@ -63,19 +63,18 @@ def in_rounds(
 
 
 def measure_in_turn(kinds: Mapping[str, Callable[[], list[Figure]]], asked: Sequence[str]) -> list[Figure]:
-    """Measure what was asked for, or all; print the table, and how busy the computer was at first."""
+    """Measure what was asked for, or all; say at first how busy the computer is."""
     figures: list[Figure] = []
     print(f"load average {os.getloadavg()[0]:.2f} on {os.cpu_count()} processors")
     for kind in asked or kinds:
         print(f"measuring {kind} …", flush=True)
         figures += kinds[kind]()
     print()
-    show(figures)
     return figures
 
 
-def show(figures: Sequence[Figure]) -> None:
-    """Print them as a table."""
+def show(figures: Sequence[Figure]) -> int:
+    """Print them as a table; the exit status: 1 if a figure falls short."""
     head = ("figure", "must reach", "measured", "")
     verdicts = {True: "reached", False: "NOT REACHED", None: ""}
     rows = [head, *((f.name, f.limit, f.measured, verdicts[f.reached]) for f in figures)]
@@ -84,3 +83,4 @@ def show(figures: Sequence[Figure]) -> None:
         print("| " + " | ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) + " |")
         if number == 0:
             print("|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return 1 if any(figure.reached is False for figure in figures) else 0

@@ -145,7 +145,9 @@ def test_it_moves_again_after_the_sensor_was_closed_by_somebody(guarded):
 
 @pytest.mark.xdist_group("real_time")
 def test_in_real_time_the_guard_stops_in_the_receiving_thread_and_retracts_in_another(tmp_path):
-    with guarded_rig(tmp_path, clock=SystemClock(), stage={"heartbeat_ms": 2000}) as guarded:
+    guard = {"sensor": "probe_force", "stage": "probe_stage", "max_force_uN": LIMIT_UN, "stale_after_ms": 1000}
+    safety = {"force_guards": [guard], "keep_out": "none"}
+    with guarded_rig(tmp_path, clock=SystemClock(), stage={"heartbeat_ms": 2000}, safety=safety) as guarded:
         guarded.press(0.0)
         guarded.stage.move_to(x_um=-10.0)
         move = guarded.stage.start_move_to(x_um=-200.0, speed_um_s=100.0)
