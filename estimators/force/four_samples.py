@@ -8,7 +8,6 @@ same three columns x³, x and v with and without it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,7 @@ _SMALLEST_RESIDUAL_SHARE = 1e-6
 # φ φᵀ for φ = (x³, x, v) as cc cx cv xx xv vv, φ F as fc fx fv, F²; and what a mass adds: ca xa va aa fa.
 _Row = tuple[float, float, float, float, float, float, float, float, float, float]
 _MassRow = tuple[float, float, float, float, float]
+_Four = tuple[float, float, float, float]
 _Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
@@ -91,8 +91,8 @@ class FourSampleRecursion:
         self.samples_used = 0
         self._normal = _NO_ROW
         self._squared: Six = _NO_ROW[:6]
-        self._mass_normal: Sequence[float] = _NO_MASS
-        self._mass_squared: Sequence[float] = _NO_MASS[:4]
+        self._mass_normal = _NO_MASS
+        self._mass_squared: _Four = _NO_MASS[:4]
         self._weight_sum = 0.0
         self._ridge_sum = 0.0
         self._theta = (0.0, 0.0, 0.0, 0.0)
@@ -183,15 +183,27 @@ class FourSampleRecursion:
     def _accumulate_mass(self, row: _MassRow, k: float) -> None:
         """The same for the mass's column; before `_accumulate`, which moves the weights on."""
         one, two, three = self._mass_stack
-        self._mass_normal = [
-            k * old + (a + b + c + e) for old, a, b, c, e in zip(self._mass_normal, row, one, two, three, strict=True)
-        ]
-        self._mass_normal[3] += self.ridge
+        ca, xa, va, aa, fa = row
+        ca1, xa1, va1, aa1, fa1 = one
+        ca2, xa2, va2, aa2, fa2 = two
+        ca3, xa3, va3, aa3, fa3 = three
+        old_ca, old_xa, old_va, old_aa, old_fa = self._mass_normal
+        self._mass_normal = (
+            k * old_ca + (ca + ca1 + ca2 + ca3),
+            k * old_xa + (xa + xa1 + xa2 + xa3),
+            k * old_va + (va + va1 + va2 + va3),
+            k * old_aa + (aa + aa1 + aa2 + aa3 + self.ridge),
+            k * old_fa + (fa + fa1 + fa2 + fa3),
+        )
         g1, g2, g3 = _growth(*self._weights, k)
-        self._mass_squared = [
-            k * k * old + (a + g1 * b + g2 * c + g3 * e)
-            for old, a, b, c, e in zip(self._mass_squared, row, one, two, three, strict=False)
-        ]
+        kk = k * k
+        old_ca, old_xa, old_va, old_aa = self._mass_squared
+        self._mass_squared = (
+            kk * old_ca + (ca + g1 * ca1 + g2 * ca2 + g3 * ca3),
+            kk * old_xa + (xa + g1 * xa1 + g2 * xa2 + g3 * xa3),
+            kk * old_va + (va + g1 * va1 + g2 * va2 + g3 * va3),
+            kk * old_aa + (aa + g1 * aa1 + g2 * aa2 + g3 * aa3),
+        )
         self._mass_stack = (row, one, two)
 
     def _solve(self) -> None:

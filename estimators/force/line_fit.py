@@ -75,17 +75,21 @@ def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
     rise -= middle * level * norm0
     slope = rise / norm1 if norm1 > 0.0 else 0.0
     left = square - level * level * norm0 - slope * rise
-    line = Fit(zero_s + middle, zero_um + level, slope, 0.0, 0.0, 0.0, norm0, norm1, 0.0, left)
+    zero_s += middle
+    zero_um += level
     if not parabola or len(points) < 4:
-        return line
-    third = sum((t - line.middle_s) ** 3 for t, _ in points)
-    line = line._replace(skew=third / norm1, spread=norm1 / norm0)
-    norm2 = curve = 0.0
+        return Fit(zero_s, zero_um, slope, 0.0, 0.0, 0.0, norm0, norm1, 0.0, left)
+    third = fourth = curve = 0.0
     for t, x in points:
-        bow = line.bow(t - line.middle_s)
-        norm2 += bow * bow
-        curve += bow * (x - line.level_um)
-    return line._replace(bend=curve / norm2, norm2=norm2, left_um2=left - curve * curve / norm2)
+        u = t - zero_s
+        squared = u * u
+        third += squared * u
+        fourth += squared * squared
+        curve += squared * (x - zero_um)
+    skew, spread = third / norm1, norm1 / norm0
+    norm2 = fourth - skew * third - spread * norm1
+    curve -= skew * rise
+    return Fit(zero_s, zero_um, slope, curve / norm2, skew, spread, norm0, norm1, norm2, left - curve * curve / norm2)
 
 
 def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest: int) -> list[float]:
