@@ -108,7 +108,8 @@ class Axis:
     @property
     def profile_end_ns(self) -> int:
         """When the last profile ends (or ended)."""
-        return self._times[-1]
+        with self._lock:  # not in the middle of a command
+            return self._times[-1]
 
     def still_from_ns(self) -> int:
         """From when on, unless it is commanded again, the position is one and the same number."""
@@ -123,7 +124,7 @@ class Axis:
     # ------------------------------------------------------------------ commands
 
     def on_change(self, listener: Callable[[int], None]) -> None:
-        """Call `listener` with the instant from which on a command changes what was planned; it must not ask back."""
+        """Call `listener` with the instant from which on a command has changed the plans; it must not ask back."""
         self._listeners.append(listener)
 
     def move(
@@ -139,21 +140,13 @@ class Axis:
 
         `deceleration` is the rate of braking, by default `acceleration`.
         """
-        braking = acceleration if deceleration is None else deceleration
         with self._lock:
-            position, velocity = self._cut(t_ns)
             bisect.insort(self._commanded_ns, t_ns)
             del self._commanded_ns[: -2 * _KEPT_SEGMENTS]
-            beyond = target - (position + velocity * abs(velocity) / (2.0 * braking))
-            if beyond * velocity < 0.0:
-                t_ns, position = self._brake(t_ns, position, velocity, braking)
-                velocity = 0.0
-            if velocity == 0.0:
-                if abs(target - position) <= _NEGLIGIBLE:
-                    self._add(t_ns, target, 0.0, 0.0)
-                    return t_ns
-                t_ns = self._cross_lost_motion(t_ns, position, target, acceleration)
-            return self._profile(t_ns, position, abs(velocity), target, speed, acceleration, braking)
+            braking = acceleration if deceleration is None else deceleration
+            end_ns = self._plan(t_ns, target, speed, acceleration, braking)
+            self._tell(t_ns)
+            return end_ns
 
     def halt(self, t_ns: int, *, deceleration: float) -> int:
         """Brake to a standstill from `t_ns` on; returns when the set-point stands."""
@@ -161,7 +154,13 @@ class Axis:
             position, velocity = self._cut(t_ns)
             end_ns, position = self._brake(t_ns, position, velocity, deceleration)
             self._add(end_ns, position, 0.0, 0.0)
+            self._tell(t_ns)
             return end_ns
+
+    def _tell(self, t_ns: int) -> None:
+        """Of a change, once it is whole: what others work out meanwhile they work out again."""
+        for listener in self._listeners:
+            listener(t_ns)
 
     def within_from_ns(self, window: float) -> int:
         """From when on the table stays within `window` (> 0) of its target; never before the profile ends."""
@@ -189,10 +188,21 @@ class Axis:
         # Before the oldest segment that is kept, the axis stands where that one begins.
         return segment, (t_ns - segment.t_ns) / NS_PER_S if i else 0.0
 
+    def _plan(self, t_ns: int, target: float, speed: float, acceleration: float, braking: float) -> int:
+        position, velocity = self._cut(t_ns)
+        beyond = target - (position + velocity * abs(velocity) / (2.0 * braking))
+        if beyond * velocity < 0.0:
+            t_ns, position = self._brake(t_ns, position, velocity, braking)
+            velocity = 0.0
+        if velocity == 0.0:
+            if abs(target - position) <= _NEGLIGIBLE:
+                self._add(t_ns, target, 0.0, 0.0)
+                return t_ns
+            t_ns = self._cross_lost_motion(t_ns, position, target, acceleration)
+        return self._profile(t_ns, position, abs(velocity), target, speed, acceleration, braking)
+
     def _cut(self, t_ns: int) -> tuple[float, float]:
         """Forget what was planned after `t_ns`; returns the set-point there."""
-        for listener in self._listeners:
-            listener(t_ns)
         state = self.setpoint_at(t_ns)
         keep = max(bisect.bisect_left(self._times, t_ns), 1)
         del self._segments[keep:], self._times[keep:]
