@@ -1,5 +1,7 @@
 """The camera suite over HTTP, in real time; and cameras that are unplugged."""
 
+from contextlib import contextmanager
+
 import pytest
 
 from microdrivers.core.errors import LinkLost, ProtocolError
@@ -12,8 +14,12 @@ pytestmark = pytest.mark.xdist_group("real_time")
 
 @pytest.mark.parametrize("name", SUITE.checks)
 def test_source_camera_over_http(name):
-    with served_camera() as (bench, _):
-        SUITE.checks[name](bench)
+    @contextmanager
+    def camera_alone():
+        with served_camera() as (bench, _):
+            yield bench
+
+    SUITE.hold_in_real_time(name, camera_alone)
 
 
 def test_an_unplugged_camera_wakes_who_waits_and_is_usable_when_it_is_back(record_property):

@@ -31,14 +31,12 @@ STAGE, ZOOM, LIVE = stage_suite.SUITE.checks, zoom_suite.SUITE.checks, live_suit
 
 @pytest.mark.parametrize("name", STAGE)
 def test_gcs_stage_on_a_pseudo_terminal(name):
-    with served_stage_bench("pty") as bench:
-        STAGE[name](bench)
+    stage_suite.SUITE.hold_in_real_time(name, lambda: served_stage_bench("pty"))
 
 
 @pytest.mark.parametrize("name", ZOOM)
 def test_az_zoom_on_a_pseudo_terminal(name):
-    with served_zoom_bench("pty") as bench:
-        ZOOM[name](bench)
+    zoom_suite.SUITE.hold_in_real_time(name, lambda: served_zoom_bench("pty"))
 
 
 @pytest.mark.parametrize("name", ["moves_each_axis_its_own_way", "a_stop_ends_the_motion_and_the_move"])
@@ -82,14 +80,12 @@ def test_a_second_host_is_turned_away():
 @pytest.mark.ports
 @pytest.mark.parametrize("name", STAGE)
 def test_a_chain_of_three_controllers_on_a_pseudo_terminal(name):
-    with served_stage_bench("pty", file=CHAINED) as bench:
-        STAGE[name](bench)
+    stage_suite.SUITE.hold_in_real_time(name, lambda: served_stage_bench("pty", file=CHAINED))
 
 
 @pytest.mark.parametrize("name", ZOOM)
 def test_az_zoom_over_modbus_tcp(name, modbus_tcp_rig):
-    with served_zoom_bench("tcp", file=modbus_tcp_rig) as bench:
-        ZOOM[name](bench)
+    zoom_suite.SUITE.hold_in_real_time(name, lambda: served_zoom_bench("tcp", file=modbus_tcp_rig))
 
 
 @pytest.mark.parametrize("file", [None, CHAINED], ids=["one controller", "chain"])
