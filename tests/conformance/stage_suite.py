@@ -12,6 +12,7 @@ import pytest
 
 from microdrivers.core.errors import MoveCancelled, MoveSuperseded, NotReferenced, OutOfRange
 from microdrivers.core.samples import XYThetaSample
+from microdrivers.core.units import NS_PER_S
 from tests.conformance.bench import StageBench
 from tests.conformance.checks import Suite
 
@@ -25,8 +26,12 @@ def _near(bench: StageBench, **shifts: float) -> dict[str, float]:
 
 
 def _truth(bench: StageBench) -> dict[str, float]:
+    return _when_and_where(bench)[1]
+
+
+def _when_and_where(bench: StageBench) -> tuple[int, dict[str, float]]:
     now_ns = bench.clock.now_ns()
-    return {axis: bench.truth(axis, now_ns) for axis in ("x", "y", "theta")}
+    return now_ns, {axis: bench.truth(axis, now_ns) for axis in ("x", "y", "theta")}
 
 
 @SUITE.check
@@ -166,10 +171,12 @@ def a_relative_move_counts_from_the_last_target(bench: StageBench) -> None:
 @SUITE.check
 def x_and_y_arrive_together_at_the_path_speed(bench: StageBench) -> None:
     bench.stage.start_move_to(**_near(bench, x_um=300.0, y_um=-400.0), speed_um_s=500.0)
-    bench.clock.sleep(0.6)
-    truth = _truth(bench)
-    dx_um, dy_um = truth["x"] - bench.home["x"], truth["y"] - bench.home["y"]
-    assert math.hypot(dx_um, dy_um) == pytest.approx(500.0 * 0.6, rel=0.1)
+    bench.clock.sleep(0.3)
+    earlier_ns, earlier = _when_and_where(bench)
+    bench.clock.sleep(0.3)
+    later_ns, later = _when_and_where(bench)
+    dx_um, dy_um = later["x"] - earlier["x"], later["y"] - earlier["y"]
+    assert math.hypot(dx_um, dy_um) / (later_ns - earlier_ns) * NS_PER_S == pytest.approx(500.0, rel=0.1)
     assert dx_um / 300.0 == pytest.approx(-dy_um / 400.0, rel=0.05)
 
 
