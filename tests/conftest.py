@@ -91,7 +91,7 @@ def force_recording(tmp_path_factory):
     from microdrivers.recording.indentation_table import IndentationTable
     from microdrivers.recording.recorder import Recorder
     from microdrivers.routines.force import IndentationPlayback
-    from microdrivers.routines.force.source import BEGIN, END, READY
+    from microdrivers.routines.force.source import BEGIN, END, READY, SETTINGS
     from microdrivers.routines.notes import note
     from microdrivers.routines.progress import SilentProgress
 
@@ -101,6 +101,7 @@ def force_recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("force")
     known = {"names": source.names._asdict(), "setup": source.setup()._asdict()}
     with Recorder(folder / "run.mcap", bus=source.bus, clock=clock, header=RecordingHeader(source="recorded")):
+        note(source.bus, clock, SETTINGS, {"around_reversal": 3, "protocol": None})
         note(source.bus, clock, READY, known)
         note(source.bus, clock, BEGIN, {})
         source.indent(lambda: None, SilentProgress())

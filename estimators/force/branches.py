@@ -9,7 +9,7 @@ import numpy as np
 from microdrivers.core.errors import NoContact
 from microdrivers.estimators.force.departure import Departure, find_departure
 from microdrivers.estimators.force.model import Array
-from microdrivers.estimators.force.record import CLEAR
+from microdrivers.estimators.force.record import CLEAR, medians_of_five
 
 BRANCH_NAMES = ("approach", "loading", "hold", "unloading", "lost")
 
@@ -84,7 +84,7 @@ def find_branches(
         NoContact: the force does not rise.
     """
     n = len(time_s)
-    peak = int(np.argmax(_smooth(deformation_um)))
+    peak = int(np.argmax(medians_of_five(np.pad(deformation_um, 2, mode="edge"))))
     onset = _onset(time_s, force_uN, force_sigma_uN)
     first = onset.early
     peak = max(peak, first + 1)
@@ -114,12 +114,6 @@ def find_branches(
         turns_s=turns,
         release_s=(float(time_s[going - 1]), float(time_s[gone])) if gone < n else None,
     )
-
-
-def _smooth(values: Array) -> Array:
-    padded = np.concatenate([values[:1].repeat(2), values, values[-1:].repeat(2)])
-    smooth: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    return smooth
 
 
 def _onset(time_s: Array, force: Array, sigma: float) -> Departure:

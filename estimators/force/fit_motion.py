@@ -13,8 +13,11 @@ from microdrivers.estimators.force.trajectory import Trajectory, trajectory
 _WITHIN_NOISE = 0.35
 """Excess of a residual's variance over the noise's that is none."""
 
-_CLEAR = 5.0
+_CHANCE_SIGMAS = 5.0
+"""By how many of its own standard deviations noise's mean square may come out too large, where that is more."""
+
 _UNSEEN_SPACING_S = 0.5
+"""Of the knots of a motion that hides in the noise of the deformation."""
 
 
 def family_of(prepared: Prepared, at: Indices, spacing_s: float) -> Trajectory:
@@ -32,7 +35,7 @@ def family_of(prepared: Prepared, at: Indices, spacing_s: float) -> Trajectory:
 
 def noise_limit(samples: int) -> float:
     """Mean square of residuals in standard deviations that noise alone does not exceed."""
-    return 1.0 + max(_WITHIN_NOISE, _CLEAR * float(np.sqrt(2.0 / samples)))
+    return 1.0 + max(_WITHIN_NOISE, _CHANCE_SIGMAS * float(np.sqrt(2.0 / samples)))
 
 
 def deformation_alone_fits(prepared: Prepared, spacing_s: float) -> bool:

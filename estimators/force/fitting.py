@@ -28,7 +28,7 @@ from microdrivers.estimators.force.joint import (
 )
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import LOADING, Indices, Prepared
-from microdrivers.estimators.force.protocols import SPRINGS_OF_UNLOADING, Fit, Protocol
+from microdrivers.estimators.force.protocols import DAMPER_OF_LOADING, SPRINGS_OF_UNLOADING, Fit, Protocol
 from microdrivers.estimators.force.ridge import ridge_fit
 from microdrivers.estimators.force.trajectory import Trajectory
 
@@ -60,7 +60,7 @@ def fit_protocol(
         spacing_s: of the knots of the trajectory, see `trajectory`.
         only_noise_from: if given, only see, from these parameters on, whether noise explains everything.
     """
-    at = np.flatnonzero(np.isin(prepared.branch, protocol.branches))
+    at = np.flatnonzero(np.isin(prepared.branch, protocol.fitted_to))
     problem = _problem(prepared, protocol, at, family_of(prepared, at, spacing_s))
     if only_noise_from is not None:
         solution, extra = solve(problem, only_noise_from, iterations=_FEW), 0.0
@@ -104,7 +104,7 @@ def fit_unloading_springs(prepared: Prepared, pooled: Fit, spacing_s: float) -> 
         return pooled
     springs = fit_protocol(prepared, SPRINGS_OF_UNLOADING, spacing_s)
     at = np.flatnonzero(prepared.branch == LOADING)
-    problem = _problem(prepared, Protocol((B_LOADING,), (LOADING,)), at, family_of(prepared, at, spacing_s))
+    problem = _problem(prepared, DAMPER_OF_LOADING, at, family_of(prepared, at, spacing_s))
     problem = problem._replace(ties=ties_of(B_LOADING), fixed=springs.theta, priors=(), kink_um=None)
     extra = springs.discrepancy_uN
     for _ in range(3):
@@ -171,7 +171,7 @@ def _problem(prepared: Prepared, protocol: Protocol, at: Indices, family: Trajec
         ties=ties_of(*groups),
         fixed=fixed,
         priors=prepared.priors(),
-        kink_um=_KINK_UM if seen and LOADING in protocol.branches else None,
+        kink_um=_KINK_UM if seen and LOADING in protocol.fitted_to else None,
     )
 
 
@@ -206,7 +206,7 @@ def _start(prepared: Prepared, protocol: Protocol, problem: Problem) -> tuple[Ar
 
 
 def _slips(prepared: Prepared, protocol: Protocol) -> list[tuple[float, float]]:
-    if SLIP not in protocol.groups:
+    if not protocol.slips:
         return [(0.0, 0.0)]
     release = prepared.branches.released_s
     if release is None:

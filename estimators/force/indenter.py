@@ -19,8 +19,14 @@ class _FrameTracker(Protocol):
     def update(self, frame: Frame) -> DeformationSample: ...
 
 
-class _OnLine(Protocol):
-    def update(self, sample: Sample) -> Sequence[SpecimenEstimate | VisionForceSample]: ...
+class _Recursion(Protocol):
+    def update(self, sample: Sample) -> Sequence[SpecimenEstimate]: ...
+
+
+class _VisionForce(Protocol):
+    def update(self, sample: Sample) -> Sequence[VisionForceSample]: ...
+
+    def finish(self) -> Sequence[VisionForceSample]: ...
 
 
 class IndentationEstimator:
@@ -38,8 +44,8 @@ class IndentationEstimator:
         tracker: _FrameTracker | None,
         matcher: IndentationMatcher,
         *,
-        recursion: _OnLine | None = None,
-        vision_force: _OnLine | None = None,
+        recursion: _Recursion | None = None,
+        vision_force: _VisionForce | None = None,
     ) -> None:
         self.matcher = matcher
         self._tracker = tracker
@@ -61,8 +67,12 @@ class IndentationEstimator:
         return found
 
     def finish(self) -> Iterable[Sample]:
-        """No more samples come; returns what was waiting for some, in order."""
-        return self._followed(self.matcher.finish())
+        """No more samples come; returns what was waiting for some, in order.
+
+        The recursion makes nothing of its last samples: no motion that follows tells whether they lie next to a corner.
+        """
+        forces = [] if self._vision_force is None else self._vision_force.finish()
+        return [*forces, *self._followed(self.matcher.finish())]
 
     def _followed(self, indentations: Iterable[IndentationSample]) -> list[Sample]:
         found: list[Sample] = []

@@ -15,17 +15,23 @@ import numpy as np
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.trajectory import Trajectory
 
-K1, K2, B_LOADING, B_UNLOADING, CONTACT, CONTACT_S, SLIP, RATE, BASE = range(9)
-"""Places in θ: µN/µm, µN/µm³, µN·s/µm twice, µm, s, µm, 1/s, µN (baseline of the force)."""
-
 PARAMETERS = 9
+"""How many there are in θ."""
+
+K1, K2, B_LOADING, B_UNLOADING, CONTACT, CONTACT_S, SLIP, RATE, BASE = range(PARAMETERS)
+"""Their places: µN/µm, µN/µm³, µN·s/µm twice, µm, s, µm, 1/s, µN (baseline of the force)."""
 
 _ITERATIONS = 30
+"""Steps of Levenberg and Marquardt at most."""
+
 _CONVERGED = 1e-4
 """Decrease of the cost, in squares of standard deviations, that is none."""
 
 _LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-13, 1e-6, 1e8
+"""Of the steps, relative to the diagonal of the normal equations; with the most, no step is left."""
+
 _RATE_LIMITS = (1e-3, 5.0)
+"""Of α in eq. (26), 1/s: below them a slip looks like a linear creep, above them like a step at the contact."""
 
 
 class Prior(NamedTuple):

@@ -14,7 +14,7 @@ class Point(NamedTuple):
     x_um: float
 
 
-class Fit(NamedTuple):
+class LineFit(NamedTuple):
     """A line, or parabola, in polynomials that are orthogonal over its points.
 
     `norm0` … `norm2` are their squared lengths, `left_um2` is the sum of the squares that the fit leaves over.
@@ -56,7 +56,7 @@ class Fit(NamedTuple):
         return math.sqrt(1.0 / self.norm1 + grow * grow / self.norm2)
 
 
-def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
+def fit(points: Sequence[Point], *, parabola: bool = False) -> LineFit:
     """Least squares; fewer than three instants make no parabola and fewer than two no slope."""
     # Sums about the newest point, so that no digits are lost.
     zero_s, zero_um = points[-1]
@@ -78,7 +78,7 @@ def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
     zero_s += middle
     zero_um += level
     if not parabola or len(points) < 4:
-        return Fit(zero_s, zero_um, slope, 0.0, 0.0, 0.0, norm0, norm1, 0.0, left)
+        return LineFit(zero_s, zero_um, slope, 0.0, 0.0, 0.0, norm0, norm1, 0.0, left)
     third = fourth = curve = 0.0
     for t, x in points:
         u = t - zero_s
@@ -89,10 +89,12 @@ def fit(points: Sequence[Point], *, parabola: bool = False) -> Fit:
     skew, spread = third / norm1, norm1 / norm0
     norm2 = fourth - skew * third - spread * norm1
     curve -= skew * rise
-    return Fit(zero_s, zero_um, slope, curve / norm2, skew, spread, norm0, norm1, norm2, left - curve * curve / norm2)
+    return LineFit(
+        zero_s, zero_um, slope, curve / norm2, skew, spread, norm0, norm1, norm2, left - curve * curve / norm2
+    )
 
 
-def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest: int) -> list[float]:
+def broken_line_gains(points: Sequence[Point], line: LineFit, *, newest: int, oldest: int) -> list[float]:
     """By how much the sum of squares falls if the line may change its slope at `points[j]`, j from newest to oldest."""
     gains = []
     middle, norm0, norm1, norm2 = line.middle_s, line.norm0, line.norm1, line.norm2
@@ -122,7 +124,7 @@ def broken_line_gains(points: Sequence[Point], line: Fit, *, newest: int, oldest
     return gains
 
 
-def shape_gain(points: Sequence[Point], line: Fit, shape: Sequence[float]) -> float:
+def shape_gain(points: Sequence[Point], line: LineFit, shape: Sequence[float]) -> float:
     """By how much the sum of squares falls if a multiple of `shape`, one value a point, is added to the fit."""
     explained = on0 = on1 = on2 = own = 0.0
     for (t, x), value in zip(points, shape, strict=True):

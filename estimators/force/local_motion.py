@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from microdrivers.core.units import NS_PER_S
-from microdrivers.estimators.force.line_fit import Fit, Point, broken_line_gains, fit, shape_gain
+from microdrivers.estimators.force.line_fit import LineFit, Point, broken_line_gains, fit, shape_gain
 from microdrivers.estimators.force.scatter import RunningScatter
 
 SHORTEST_LAG = 4
@@ -51,7 +51,7 @@ class MotionSettings(NamedTuple):
     max_gap_s: float = 0.25
 
 
-class Motion(NamedTuple):
+class InstantMotion(NamedTuple):
     """The motion at one instant.
 
     Attributes:
@@ -116,13 +116,13 @@ class LocalMotion:
         self._after_corner = False
         self._speed_um_s = 0.0
 
-    def update(self, t_ns: int, x_um: float, sigma_um: float) -> list[Motion]:
+    def update(self, t_ns: int, x_um: float, sigma_um: float) -> list[InstantMotion]:
         """Take a position, newer than all before.
 
         Returns:
             The motions that are now certain, oldest first.
         """
-        motions: list[Motion] = []
+        motions: list[InstantMotion] = []
         newest = self._newest
         if newest and t_ns - newest[-1].t_ns > self.settings.max_gap_s * NS_PER_S:
             motions = self.tell_now()
@@ -139,7 +139,7 @@ class LocalMotion:
         self._unscreened = True
         return motions
 
-    def tell_now(self) -> list[Motion]:
+    def tell_now(self) -> list[InstantMotion]:
         """Tell what has not been told yet, from what is known; the motion goes on."""
         motions = self._push(self._newest[-1], spike=False) if self._unscreened else []
         self._unscreened = False
@@ -170,8 +170,8 @@ class LocalMotion:
         beyond_um = max(min(before.x_um, x_um) - middle.x_um, middle.x_um - max(before.x_um, x_um))
         return beyond_um > _SPIKE_SIGMAS * middle.sigma_um + self._speed_um_s * (t_s - before.t_s)
 
-    def _push(self, position: _Position, *, spike: bool) -> list[Motion]:
-        motions: list[Motion] = []
+    def _push(self, position: _Position, *, spike: bool) -> list[InstantMotion]:
+        motions: list[InstantMotion] = []
         t_ns, t_s, x_um, sigma_um, _, _ = position
         self._pending.append(_Position(t_ns, t_s, x_um, sigma_um, self._count, spike))
         self._count += 1
@@ -194,17 +194,17 @@ class LocalMotion:
             motions += self._settle(surplus, line, self._count + _FAR)
         return motions
 
-    def _fit(self, points: Sequence[Point]) -> Fit:
+    def _fit(self, points: Sequence[Point]) -> LineFit:
         return fit(points, parabola=self.settings.with_acceleration)
 
-    def _settle(self, count: int, line: Fit, corner_rank: int) -> list[Motion]:
+    def _settle(self, count: int, line: LineFit, corner_rank: int) -> list[InstantMotion]:
         """Tell the oldest pending positions; the next corner lies right before the one with `corner_rank`."""
         motions = []
         for _ in range(count):
             t_ns, t_s, x_um, sigma_um, rank, spike = self._pending.popleft()
             clearance = corner_rank - 1 - rank
             motions.append(
-                Motion(
+                InstantMotion(
                     t_ns,
                     line.position_um(t_s) if spike else x_um,
                     sigma_um,
@@ -222,7 +222,7 @@ class LocalMotion:
 
     # ------------------------------------------------------------------ corners
 
-    def _suspect(self, line: Fit, least_um2: float) -> int:
+    def _suspect(self, line: LineFit, least_um2: float) -> int:
         """Index of the point before a corner, if one explains as much as `least_um2`; else the number of points."""
         points = self._points
         newest = len(points) - 2
@@ -236,7 +236,7 @@ class LocalMotion:
         before, after = fit(points[: at + 1]).slope, fit(points[at:]).slope
         return abs(after - before) >= _LEAST_TURN * max(abs(after), abs(before))
 
-    def _turn_near(self, line: Fit, at: int, least_um2: float) -> list[Motion]:
+    def _turn_near(self, line: LineFit, at: int, least_um2: float) -> list[InstantMotion]:
         """Turn at the corner near a point, or at a jump if that explains clearly more; there may be neither."""
         points = self._points
         begin_s, end_s = points[at - 1].t_s, points[at + 1].t_s
@@ -249,7 +249,7 @@ class LocalMotion:
             return self._turn(points[at - 1 + jumps.index(max(jumps))].t_s, jump=True)
         return self._turn(instants[gains.index(max(gains))], jump=False) if self._bends(at) else []
 
-    def _turn(self, corner_s: float, *, jump: bool) -> list[Motion]:
+    def _turn(self, corner_s: float, *, jump: bool) -> list[InstantMotion]:
         """Tell what lies before a corner, and begin a new motion there."""
         assert self._zero_ns is not None
         old = [point for point in self._points if point.t_s <= corner_s]

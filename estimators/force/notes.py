@@ -12,6 +12,9 @@ from microdrivers.estimators.force.record import CLEAR, IndentationRecord
 _SHARE_OF_FORCE = 0.01
 """What a force out of contact must be of the largest to be worth a word."""
 
+_FEWEST_PULLED = 3
+"""Samples of a clearly negative force that are no outliers."""
+
 
 def notes_on(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) -> list[str]:
     """What should be known of a record.
@@ -33,10 +36,13 @@ def notes_on(record: IndentationRecord, prepared: Prepared, *, both_ways: bool) 
     if abs(zero_uN) > least_uN:
         notes.append(f"the force is {zero_uN:.3g} µN out of contact: the sensor's zero, which is taken off everywhere")
     pulled = prepared.force_uN[prepared.used]
-    if np.sum(pulled < -6.0 * prepared.force_sigma_uN) >= 3:
+    if np.sum(pulled < -CLEAR * prepared.force_sigma_uN) >= _FEWEST_PULLED:
         notes.append(f"adhesion: the specimen pulls with up to {-pulled.min():.3g} µN, which the model does not have")
     if prepared.contact.seen == "nothing":
-        notes.append("the record begins in contact, or noise hides where: the contact point is that of its own zero")
+        notes.append(
+            "the record begins in contact, or noise hides the onset; "
+            "the record's own zero is taken as the contact point"
+        )
     full = len(prepared.excluded.get("saturated", ()))
     if full:
         notes.append(f"the sensor was at the end of its range in {full} samples, which are left out")

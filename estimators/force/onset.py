@@ -10,14 +10,18 @@ from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.force.line_fit import Point, fit
 from microdrivers.estimators.force.scatter import RunningScatter
 
-_ALLOWANCE = 2.0
-_ALARM = 12.0
-_FEWEST = 15
-_REMEMBERED = 90
+_ALLOWANCE, _ALARM = 2.0, 12.0
+"""Of the sum, in standard deviations of a reading: what a sample may exceed the baseline by without adding to it, and
+what is a contact."""
+
+_FEWEST, _REMEMBERED = 15, 90
+"""Samples before the contact that tell the baseline: so many at least, and the newest so many; 0.5 and 3 s at 30 Hz."""
+
 _MOVES_SIGMAS = 4.0
+"""Of the deformation's slope before the contact: what moves by more follows the tool."""
 
 
-class Contact(NamedTuple):
+class Onset(NamedTuple):
     """Where and when the tool met the specimen.
 
     Attributes:
@@ -49,7 +53,7 @@ class ForceOnset:
         self._rising: list[tuple[int, float, float]] = []
         self._sum = 0.0
 
-    def update(self, t_ns: int, deformation_um: float, deformation_sigma_um: float, force_uN: float) -> Contact | None:
+    def update(self, t_ns: int, deformation_um: float, deformation_sigma_um: float, force_uN: float) -> Onset | None:
         """Take one instant; the contact as soon as it is certain."""
         self._scatter.add(t_ns / NS_PER_S, force_uN)
         sample = (t_ns, deformation_um, force_uN)
@@ -69,7 +73,7 @@ class ForceOnset:
             return None
         at_ns = (self._before[-1][0] + self._rising[0][0]) // 2
         contact_um = self._zero_um(at_ns, deformation_sigma_um)
-        return Contact(at_ns, contact_um, baseline_uN, sigma_uN)
+        return Onset(at_ns, contact_um, baseline_uN, sigma_uN)
 
     def _zero_um(self, at_ns: int, sigma_um: float) -> float:
         line = fit([Point((t_ns - at_ns) / NS_PER_S, x_um) for t_ns, x_um, _ in self._before])

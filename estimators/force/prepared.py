@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from microdrivers.core.errors import DataError, SaturatedData
 from microdrivers.estimators.force.branches import CLEAR_SLOPE, Branches, find_branches
 from microdrivers.estimators.force.joint import BASE, CONTACT, CONTACT_S, PARAMETERS, Prior
 from microdrivers.estimators.force.model import Array
-from microdrivers.estimators.force.record import IndentationRecord, lost, saturated, white_sigma
+from microdrivers.estimators.force.record import IndentationRecord, Mask, lost, saturated, white_sigma
 
 Indices = npt.NDArray[np.int64]
 SeenBefore = Literal["surface", "tip", "nothing"]
@@ -20,16 +21,26 @@ LOADING, HOLD, UNLOADING = 0, 1, 2
 """Numbers of the branches in contact."""
 
 _FEWEST_IN_FIT = 10
+"""Samples of the loading: with fewer a fit says nothing."""
+
 _MOSTLY = 0.5
+"""Of the loading's samples: if more are saturated, that is why too few are left."""
+
 _NOISE_SCATTER = 5.0
 """Three relative standard deviations of an observed noise, times the root of the number of samples."""
 
 _SHORTEST_BASELINE = 15
+"""Samples out of contact at either end that a drift takes to be seen."""
+
 _LARGEST_SHARE = 0.2
 """Of a branch's samples: what may be left out at either end."""
+
 _MOVES = 0.5
 """Of the loading speed: what moves at that before the contact is the tool, not the specimen."""
+
 _SHORTEST_HOLD_S = 1.0
+"""What stays for less is a stage that turns round slowly."""
+
 _TIP_SAMPLES = 30
 """Before the contact, that tell whether the deformation follows the tool and how."""
 
@@ -95,7 +106,7 @@ class Prepared(NamedTuple):
     time_s: Array
     deformation_um: Array
     force_uN: Array
-    measured: npt.NDArray[np.bool_]
+    measured: Mask
     deformation_sigma_um: float
     force_sigma_uN: float
     branches: Branches
@@ -135,8 +146,8 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         np.interp(time_s, time_s[measured], np.asarray(values, dtype=np.float64)[measured])
         for values in (record.deformation_um, record.force_uN)
     )
-    sigma_x = _noise(record.deformation_sigma_um, deformation[measured])
-    sigma_f = _noise(record.force_sigma_uN, force[measured])
+    sigma_x = _stated_unless_exceeded(record.deformation_sigma_um, deformation[measured])
+    sigma_f = _stated_unless_exceeded(record.force_sigma_uN, force[measured])
     branches = find_branches(time_s, deformation, force, deformation_sigma_um=sigma_x, force_sigma_uN=sigma_f)
     frame_s = float(np.median(np.diff(time_s)))
     base, base_sigma = _baseline(time_s, force, branches, measured, sigma_f, around_reversal)
@@ -147,27 +158,9 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         "saturated": full,
         **_turning(time_s, branches, around_reversal, margins),
     }
-    excluded, free = {}, np.ones(len(time_s), dtype=bool)
-    for reason, mask in reasons.items():
-        if np.any(mask & free):
-            excluded[reason] = np.flatnonzero(mask & free)
-        free &= ~mask
-    number = np.full(len(time_s), -1)
-    for index, part in ((LOADING, branches.loading), (HOLD, branches.hold), (UNLOADING, branches.unloading)):
-        number[part.start : part.stop] = index
-    used = np.flatnonzero(free)
-    loading = int(np.sum(number[used] == LOADING))
-    in_loading = full[branches.loading.start : branches.loading.stop]
-    if loading < _FEWEST_IN_FIT and np.count_nonzero(in_loading) > _MOSTLY * len(in_loading):
-        raise SaturatedData(
-            f"the sensor is at the end of its range nearly throughout the loading, and {loading} samples are left",
-            remedy="indent less deep or slower, or use a sensor with a wider range",
-        )
-    if loading < _FEWEST_IN_FIT:
-        raise DataError(
-            f"{loading} samples of the loading are usable, at least {_FEWEST_IN_FIT} are needed",
-            remedy="indent deeper or slower, or record at a higher rate",
-        )
+    excluded, used = _parted(reasons, len(time_s))
+    branch = _branch_numbers(branches, len(time_s))[used]
+    _require_loading(int(np.sum(branch == LOADING)), full[branches.loading.start : branches.loading.stop])
     return Prepared(
         time_s=time_s,
         deformation_um=deformation,
@@ -177,7 +170,7 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         force_sigma_uN=sigma_f,
         branches=branches,
         used=used,
-        branch=number[used],
+        branch=branch,
         excluded=excluded,
         contact=_contact(time_s, deformation, force, branches, sigma_x, sigma_f, frame_s, around_reversal),
         baseline_uN=base,
@@ -187,7 +180,40 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
     )
 
 
-def _noise(stated: float, values: Array) -> float:
+def _parted(reasons: Mapping[str, Mask], samples: int) -> tuple[dict[str, Indices], Indices]:
+    """Samples that are left out, by the first reason that holds for each, and the others."""
+    excluded, free = {}, np.ones(samples, dtype=bool)
+    for reason, mask in reasons.items():
+        if np.any(mask & free):
+            excluded[reason] = np.flatnonzero(mask & free)
+        free &= ~mask
+    return excluded, np.flatnonzero(free)
+
+
+def _branch_numbers(branches: Branches, samples: int) -> Indices:
+    """Number of the branch of every sample; −1 out of contact."""
+    number = np.full(samples, -1)
+    for index, part in ((LOADING, branches.loading), (HOLD, branches.hold), (UNLOADING, branches.unloading)):
+        number[part.start : part.stop] = index
+    return number
+
+
+def _require_loading(usable: int, full: Mask) -> None:
+    """Refuse a loading with too few samples for a fit; `full`: where in it the sensor was at the end of its range."""
+    if usable >= _FEWEST_IN_FIT:
+        return
+    if np.count_nonzero(full) > _MOSTLY * len(full):
+        raise SaturatedData(
+            f"the sensor is at the end of its range nearly throughout the loading, and {usable} samples are left",
+            remedy="indent less deeply or more slowly, or use a sensor with a wider range",
+        )
+    raise DataError(
+        f"{usable} samples of the loading are usable, at least {_FEWEST_IN_FIT} are needed",
+        remedy="indent deeper or more slowly, or record at a higher rate",
+    )
+
+
+def _stated_unless_exceeded(stated: float, values: Array) -> float:
     """Stated noise, unless more of it is seen; a trace of the values' range where there is none at all."""
     stated = stated if np.isfinite(stated) else 0.0
     observed = white_sigma(values)
@@ -197,13 +223,13 @@ def _noise(stated: float, values: Array) -> float:
     return float(max(found, 1e-9 * np.ptp(values)))
 
 
-def _mask(n: int, part: range) -> npt.NDArray[np.bool_]:
+def _mask(n: int, part: range) -> Mask:
     mask = np.zeros(n, dtype=bool)
     mask[part.start : part.stop] = True
     return mask
 
 
-def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -> dict[str, npt.NDArray[np.bool_]]:
+def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -> dict[str, Mask]:
     """Samples next to contact, reversals and release, and those about them in which the speed settles."""
     n = len(time_s)
     near, settling = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -229,13 +255,12 @@ def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -
             settling[unsettled : part.stop] = True
     hold = branches.hold
     if len(hold) and time_s[hold.stop - 1] - time_s[hold.start] < _SHORTEST_HOLD_S:
-        # A stage that turns round slowly.
         near[hold.start : hold.stop] = True
     return {"around contact and reversals": near, "speed not settled": settling}
 
 
 def _baseline(
-    time_s: Array, force: Array, branches: Branches, measured: npt.NDArray[np.bool_], sigma: float, around: int
+    time_s: Array, force: Array, branches: Branches, measured: Mask, sigma: float, around: int
 ) -> tuple[Array, float]:
     """The force out of contact: a constant, or a line if there is enough of it at both ends and it drifts clearly."""
     before = _at_rest(range(branches.approach.start, branches.approach.stop - around), measured)
@@ -252,7 +277,7 @@ def _baseline(
     return np.full_like(time_s, level), sigma / float(np.sqrt(len(rest)))
 
 
-def _at_rest(part: range, measured: npt.NDArray[np.bool_]) -> Indices:
+def _at_rest(part: range, measured: Mask) -> Indices:
     indices = np.arange(part.start, max(part.stop, part.start))
     kept: Indices = indices[measured[indices]]
     return kept

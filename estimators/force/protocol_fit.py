@@ -32,9 +32,13 @@ _WIDEST = 0.25
 """Half-width of a 95 % interval, relative to its parameter, that still tells something about the specimen."""
 
 _CONFOUNDED = 0.9
+"""Correlation of damper and contact point beyond which the record hardly tells them apart."""
+
 _COMES_BACK = 0.2
+"""Of what was left when the tip let go: what comes back of a specimen that has not slipped."""
+
 _AT_THE_ENDS = 5
-"""Of what was left when the tip let go: what comes back of a specimen that has not slipped; samples to tell it by."""
+"""Samples after the loss of contact, and at the end, that tell what came back."""
 
 _SPRINGS_AND_DAMPER = (K1, K2, B_LOADING)
 _PLACES = {"k1": K1, "k2": K2, "b": B_LOADING, "slip": SLIP, "slip_rate": RATE}
@@ -51,10 +55,10 @@ class ProtocolFit:
         contact_um: where x = 0 lies in the deformation's own coordinate. contact_time_s: when it was touched.
         slip_um, slip_rate_per_s: offset and α of eq. (26); 0 unless the protocol has them.
         covariance: 3 × 3, of (k1, k2, b_loading) in these units.
-        sigma_k1_uN_per_um, sigma_k2_uN_per_um3, sigma_b_uN_s_per_um, sigma_contact_um, sigma_contact_time_s,
-            sigma_slip_um, sigma_slip_rate_per_s: standard deviations; 95 % intervals are ±1.96 of them.
+        sigma_k1_uN_per_um, sigma_k2_uN_per_um3, sigma_b_uN_s_per_um, sigma_contact_um, sigma_slip_um,
+           , sigma_slip_rate_per_s: standard deviations; 95 % intervals are ±1.96 of them.
         error_percent: 100·RMS(F − F̂)/RMS(F) over all used samples (of the loading alone for `loading`), F̂ from the
-            measured deformation and the trajectory's speed. error_percent_loading: over the loading.
+            measured deformation and the trajectory's speed.
         noise_residual_ratio: RMS(F − F̂) relative to what noise of force and deformation alone leaves.
         condition_number: of the scaled regressor of eq. (22) on the protocol's samples.
         identifiable: for k1, k2, b, m (and slip, slip_rate): the record determines it, and the model explains the
@@ -86,11 +90,9 @@ class ProtocolFit:
     sigma_k2_uN_per_um3: float
     sigma_b_uN_s_per_um: float
     sigma_contact_um: float
-    sigma_contact_time_s: float
     sigma_slip_um: float
     sigma_slip_rate_per_s: float
     error_percent: float
-    error_percent_loading: float
     noise_residual_ratio: float
     condition_number: float
     identifiable: Mapping[str, bool]
@@ -149,7 +151,6 @@ def named_parameters(theta: Array, covariance: Array) -> dict[str, float]:
         "sigma_k2_uN_per_um3": sigma[K2],
         "sigma_b_uN_s_per_um": sigma[B_LOADING],
         "sigma_contact_um": sigma[CONTACT],
-        "sigma_contact_time_s": sigma[CONTACT_S],
         "sigma_slip_um": sigma[SLIP],
         "sigma_slip_rate_per_s": sigma[RATE],
     }
@@ -252,7 +253,8 @@ def _confounded(prepared: Prepared, theta: Array, covariance: Array, sigma: Arra
         prepared.time_s[last] - prepared.time_s[first]
     )
     shift = abs(float(theta[K1])) * INTERVAL * known / abs(speed)
-    begins = "the record begins in contact, or noise hides where, and " if prepared.contact.seen == "nothing" else ""
+    unseen = prepared.contact.seen == "nothing"
+    begins = "the record begins in contact, or noise hides the onset, and " if unseen else ""
     return (
         f"{begins}at constant speed b·v cannot be told from the contact point: known to ±{INTERVAL * known:.2g} µm, "
         f"that alone is ±{shift:.2g} µN·s/µm of b"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
+from microdrivers.core.protocol_names import ProtocolName as ProtocolName
 from microdrivers.estimators.force.joint import B_LOADING, B_UNLOADING, K1, K2, RATE, SLIP, Solution
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import HOLD, LOADING, UNLOADING, Indices
-
-ProtocolName = Literal["single", "unloading_springs", "loading_only", "slip_corrected", "loading"]
 
 
 class Protocol(NamedTuple):
@@ -16,19 +15,37 @@ class Protocol(NamedTuple):
 
     Attributes:
         groups: parameters to estimate besides contact and baseline; a group shares one value.
-        branches: numbers of the branches whose samples are fitted.
+        fitted_to: numbers of the branches whose samples its parameters come from.
+        judged_by: numbers of the branches whose samples its error and misfit are of.
     """
 
     groups: tuple[int | tuple[int, ...], ...]
-    branches: tuple[int, ...]
+    fitted_to: tuple[int, ...]
+    judged_by: tuple[int, ...]
+
+    @property
+    def explains_both_ways(self) -> bool:
+        """Whether it is fitted to both branches; `loading_only` merely predicts the unloading."""
+        return {LOADING, UNLOADING} <= {*self.fitted_to}
+
+    @property
+    def slips(self) -> bool:
+        """Whether it estimates the offset and α of eq. (26)."""
+        return SLIP in self.groups
 
 
 _ALL = (LOADING, HOLD, UNLOADING)
-SINGLE = Protocol((K1, K2, (B_LOADING, B_UNLOADING)), _ALL)
-UNDAMPED_RETURN = Protocol((K1, K2, B_LOADING), _ALL)
-SPRINGS_OF_UNLOADING = Protocol((K1, K2), (UNLOADING,))
-LOADING_ALONE = Protocol((K1, K2, B_LOADING), (LOADING,))
-SLIP_CORRECTED = Protocol((K1, K2, B_LOADING, SLIP, RATE), _ALL)
+PROTOCOLS: dict[ProtocolName, Protocol] = {
+    "single": Protocol((K1, K2, (B_LOADING, B_UNLOADING)), _ALL, _ALL),
+    "unloading_springs": Protocol((K1, K2, B_LOADING), _ALL, _ALL),
+    "slip_corrected": Protocol((K1, K2, B_LOADING, SLIP, RATE), _ALL, _ALL),
+    "loading_only": Protocol((K1, K2, B_LOADING), (LOADING,), _ALL),
+    "loading": Protocol((K1, K2, B_LOADING), (LOADING,), (LOADING,)),
+}
+"""Of `unloading_springs`, see `fit_unloading_springs` besides."""
+
+SPRINGS_OF_UNLOADING = Protocol((K1, K2), (UNLOADING,), (UNLOADING,))
+DAMPER_OF_LOADING = Protocol((B_LOADING,), (LOADING,), (LOADING,))
 
 
 class Fit(NamedTuple):

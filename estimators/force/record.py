@@ -108,6 +108,12 @@ def white_sigma(values: Array) -> float:
     return max(seen, float(np.min(np.diff(levels))) / np.sqrt(12.0)) if rounded else seen
 
 
+def medians_of_five(values: Array) -> Array:
+    """Medians of five, two samples shorter at either end: a single outlier is no contact and no reversal."""
+    smooth: Array = np.median(np.lib.stride_tricks.sliding_window_view(values, 5), axis=1)
+    return smooth
+
+
 def check(record: IndentationRecord) -> None:
     """Refuse what cannot be an indentation.
 
@@ -153,7 +159,7 @@ def _check_shapes(record: IndentationRecord) -> None:
     if n < FEWEST_SAMPLES:
         raise DataError(
             f"the record has {n} samples; at least {FEWEST_SAMPLES} are needed",
-            remedy="indent deeper or slower, or record at a higher rate",
+            remedy="indent deeper or more slowly, or record at a higher rate",
         )
 
 
@@ -190,16 +196,16 @@ def _check_force(record: IndentationRecord, unseen: Mask) -> None:
         raise SaturatedData(
             f"the sensor is at the end of its range ({record.force_uN[full][0]:.6g} µN) in {np.sum(full)} of "
             f"{len(full)} samples",
-            remedy="indent less deep, or use a sensor with a wider range",
+            remedy="indent less deeply, or use a sensor with a wider range",
         )
-    observed, noise = white_sigma(force), _noise(record.force_sigma_uN, force)
+    observed, noise = white_sigma(force), _larger_of_stated_and_seen(record.force_sigma_uN, force)
     low, high = (share * observed for share in _STATED_OVER_OBSERVED_NOISE)
     if low < record.force_sigma_uN < high:
         raise DataError(
             f"implausible units: the force has noise of {observed:.3g} µN, stated is {record.force_sigma_uN:.3g} µN",
             remedy=_UNITS,
         )
-    smooth = _smooth(force)
+    smooth = medians_of_five(force)
     if np.ptp(smooth) < CLEAR * noise:
         raise NoContact(
             f"no contact: the force varies by {np.ptp(smooth):.3g} µN over the whole travel, noise is {noise:.3g} µN",
@@ -214,15 +220,9 @@ def _check_force(record: IndentationRecord, unseen: Mask) -> None:
         )
 
 
-def _smooth(values: Array) -> Array:
-    """Medians of five, two samples shorter at either end: a single outlier is no contact and no reversal."""
-    smooth: Array = np.median(np.lib.stride_tricks.sliding_window_view(values, 5), axis=1)
-    return smooth
-
-
 def _check_signs(record: IndentationRecord, unseen: Mask) -> None:
     """Whether the deformation grows where the force does, and both are positive."""
-    force, deformation = _smooth(record.force_uN[~unseen]), _smooth(record.deformation_um[~unseen])
+    force, deformation = medians_of_five(record.force_uN[~unseen]), medians_of_five(record.deformation_um[~unseen])
     if min(np.ptp(force), np.ptp(deformation)) == 0.0:
         return
     together = float(np.corrcoef(force, deformation)[0, 1])
@@ -246,7 +246,7 @@ def _check_signs(record: IndentationRecord, unseen: Mask) -> None:
 def _check_one(record: IndentationRecord, unseen: Mask) -> None:
     """Whether the record holds one indentation: the force does not rise again after the tool has come back."""
     time_s = record.time_s[~unseen][2:-2]
-    force, deformation = _smooth(record.force_uN[~unseen]), _smooth(record.deformation_um[~unseen])
+    force, deformation = medians_of_five(record.force_uN[~unseen]), medians_of_five(record.deformation_um[~unseen])
     level = (force - force.min()) / np.ptp(force)
     way = (deformation - deformation.min()) / np.ptp(deformation)
     tops: list[int] = []
@@ -277,7 +277,7 @@ def _starts_deep(record: IndentationRecord, unseen: Mask) -> bool:
 def _check_units(record: IndentationRecord, unseen: Mask) -> None:
     deformation, force = record.deformation_um[~unseen], record.force_uN[~unseen]
     depth = float(np.ptp(deformation))
-    if depth < CLEAR * _noise(record.deformation_sigma_um, deformation) or depth == 0.0:
+    if depth < CLEAR * _larger_of_stated_and_seen(record.deformation_sigma_um, deformation) or depth == 0.0:
         raise DataError(
             f"the deformation varies by {depth:.3g} µm only, which is its noise",
             remedy="check that the contact point is followed, and that its deformation (indentation_um) is in µm",
@@ -297,6 +297,6 @@ def _check_units(record: IndentationRecord, unseen: Mask) -> None:
         raise DataError(f"implausible units: a force of {largest:.4g} µN", remedy=_UNITS)
 
 
-def _noise(stated: float, values: Array) -> float:
+def _larger_of_stated_and_seen(stated: float, values: Array) -> float:
     observed = white_sigma(values)
     return max(stated if np.isfinite(stated) else 0.0, observed if np.isfinite(observed) else 0.0)

@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 from microdrivers.core.contact_samples import IndentationSample, SpecimenEstimate
 from microdrivers.core.samples import Sample
 from microdrivers.estimators.force.four_samples import FourSampleRecursion, Scales
-from microdrivers.estimators.force.local_motion import LocalMotion, Motion, MotionSettings
-from microdrivers.estimators.force.onset import Contact, ForceOnset
+from microdrivers.estimators.force.local_motion import InstantMotion, LocalMotion, MotionSettings
+from microdrivers.estimators.force.onset import ForceOnset, Onset
 
 Branch = Literal["loading", "unloading"]
 
@@ -58,6 +58,8 @@ class RecursionSettings(NamedTuple):
 class SpecimenRecursion:
     """Indentations in; out, `lag` samples later, the running estimate of (k1, k2, b), or with m.
 
+    The last `lag` samples of a record are left out: where the motion has a corner there, none that follow show it.
+
     The velocity is the slope of a straight fit, centred on the sample, that never reaches across a reversal, a start
     or a stop; the samples next to one are left out. Before contact nothing is estimated. Loading and unloading may
     differ: the memory is cut where the motion changes its sign, or each branch has its own estimate.
@@ -87,10 +89,10 @@ class SpecimenRecursion:
         self.device = device
         self.late_samples = 0
         self.excluded_samples = 0
-        self.contact: Contact | None = None
+        self.contact: Onset | None = None
         self._onset = ForceOnset(least_sigma_uN=chosen.baseline_sigma_uN) if contact_um is None else None
         if contact_um is not None:
-            self.contact = Contact(t_ns=-1, contact_um=contact_um, baseline_uN=0.0, sigma_uN=0.0)
+            self.contact = Onset(t_ns=-1, contact_um=contact_um, baseline_uN=0.0, sigma_uN=0.0)
         self._motion = LocalMotion(
             MotionSettings(
                 lag=chosen.lag, window=chosen.window, with_acceleration=chosen.with_mass, max_gap_s=chosen.max_gap_s
@@ -144,7 +146,7 @@ class SpecimenRecursion:
 
     # ------------------------------------------------------------------ one sample
 
-    def _take(self, sample: IndentationSample, motion: Motion) -> SpecimenEstimate | None:
+    def _take(self, sample: IndentationSample, motion: InstantMotion) -> SpecimenEstimate | None:
         contact = self.contact
         if contact is None or motion.t_ns < contact.t_ns:
             return None
@@ -165,14 +167,14 @@ class SpecimenRecursion:
         )
         return self._report(sample, recursion, force_uN - predicted_uN if known else math.nan)
 
-    def _is_usable(self, motion: Motion, x_um: float, force_uN: float, sigma_uN: float) -> bool:
+    def _is_usable(self, motion: InstantMotion, x_um: float, force_uN: float, sigma_uN: float) -> bool:
         """Whether the tool presses, and the velocity is known: neither next to a corner nor of a spike."""
         self._largest_uN = max(self._largest_uN, force_uN)
         least_uN = max(_FORCE_SIGMAS * sigma_uN, self.settings.least_share * self._largest_uN)
         clear = motion.clearance >= self.settings.clearance and math.isfinite(motion.velocity_sigma_um_s)
         return clear and not motion.spike and x_um > 0.0 and force_uN > least_uN
 
-    def _follow(self, motion: Motion) -> float:
+    def _follow(self, motion: InstantMotion) -> float:
         """λ for this sample; where the motion has changed its sign, the stack begins anew."""
         speed = motion.velocity_um_s
         if abs(speed) <= _MOVES_SIGMAS * motion.velocity_sigma_um_s:

@@ -11,15 +11,7 @@ from microdrivers.estimators.force.fitting import fit_protocol, fit_unloading_sp
 from microdrivers.estimators.force.joint import B_LOADING, B_UNLOADING, force_of
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import LOADING, UNLOADING, Margins, Prepared, prepare
-from microdrivers.estimators.force.protocols import (
-    LOADING_ALONE,
-    SINGLE,
-    SLIP_CORRECTED,
-    UNDAMPED_RETURN,
-    Fit,
-    Protocol,
-    ProtocolName,
-)
+from microdrivers.estimators.force.protocols import PROTOCOLS, Fit, Protocol, ProtocolName
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.estimators.force.trajectory import KNOT_SPACINGS_S, RAMP
 
@@ -37,13 +29,6 @@ _STILL_SETTLING = 5.0
 _BEYOND_NOISE = 4.0
 _UNSEEN = 3.0
 """Times what motion that the camera does not see can do to the force: more than that is not the trajectory's fault."""
-
-_PROTOCOLS: dict[ProtocolName, Protocol] = {
-    "single": SINGLE,
-    "unloading_springs": UNDAMPED_RETURN,
-    "slip_corrected": SLIP_CORRECTED,
-    "loading": LOADING_ALONE,
-}
 
 Fits = dict[ProtocolName, Fit]
 
@@ -88,14 +73,14 @@ def all_protocols(prepared: Prepared, on_ramps: Mapping[ProtocolName, Fit]) -> F
         name = min(fits, key=lambda name: fits[name].discrepancy_uN)
         followed = (spacing_s for spacing_s in KNOT_SPACINGS_S if deformation_alone_fits(prepared, spacing_s))
         spacing_s = next(followed, KNOT_SPACINGS_S[-1])
-        found = _on_splines(prepared, _PROTOCOLS[name], fits[name], straight=spacing_s == RAMP)
+        found = _on_splines(prepared, PROTOCOLS[name], fits[name], straight=spacing_s == RAMP)
         if found is not None or spacing_s != RAMP:
-            fits = {key: _refitted(prepared, _PROTOCOLS[key], fit, found, spacing_s) for key, fit in fits.items()}
+            fits = {key: _refitted(prepared, PROTOCOLS[key], fit, found, spacing_s) for key, fit in fits.items()}
     if "single" in fits:
         fits["unloading_springs"] = fit_unloading_springs(prepared, fits["unloading_springs"], spacing_s)
-        loading = fit_protocol(prepared, _PROTOCOLS["loading"], spacing_s)
+        loading = fit_protocol(prepared, PROTOCOLS["loading"], spacing_s)
         if found is not None and not loading.within_noise:
-            loading = _refitted(prepared, _PROTOCOLS["loading"], loading, found, spacing_s)
+            loading = _refitted(prepared, PROTOCOLS["loading"], loading, found, spacing_s)
         fits["loading_only"] = fits["loading"] = loading
     return fits
 
@@ -109,7 +94,7 @@ def _over_both(prepared: Prepared) -> Fits:
     whole: tuple[ProtocolName, ...] = ("single", "unloading_springs", "slip_corrected")
     enough = np.count_nonzero(prepared.branch == UNLOADING) >= _FEWEST_OF_UNLOADING
     names: tuple[ProtocolName, ...] = whole if enough else ("loading",)
-    return {name: fit_protocol(prepared, _PROTOCOLS[name], RAMP) for name in names}
+    return {name: fit_protocol(prepared, PROTOCOLS[name], RAMP) for name in names}
 
 
 def _margins(prepared: Prepared, fit: Fit, *, by_force: bool) -> Margins:

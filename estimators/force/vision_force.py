@@ -9,7 +9,7 @@ from typing import NamedTuple
 from microdrivers.core.contact_samples import DeformationSample, VisionForceSample
 from microdrivers.core.samples import Sample
 from microdrivers.core.units import NS_PER_S
-from microdrivers.estimators.force.local_motion import LocalMotion, Motion, MotionSettings
+from microdrivers.estimators.force.local_motion import InstantMotion, LocalMotion, MotionSettings
 from microdrivers.estimators.force.model import (
     SpecimenModel,
     force_uN,
@@ -110,16 +110,19 @@ class VisionForce:
             return []
         self._newest_ns = sample.t_ns
         if not sample.found or not math.isfinite(sample.deformation_um):
-            forces = [self._force(motion) for motion in self._motion.tell_now()]
-            return [*forces, self._publish(sample, math.nan, math.nan, math.nan, {LOST})]
+            return [*self.finish(), self._publish(sample, math.nan, math.nan, math.nan, {LOST})]
         self._waiting.append(sample)
         return [
             self._force(motion) for motion in self._motion.update(sample.t_ns, sample.deformation_um, sample.sigma_um)
         ]
 
+    def finish(self) -> list[VisionForceSample]:
+        """No more deformations come: the forces of the frames that wait, by what is known now, oldest first."""
+        return [self._force(motion) for motion in self._motion.tell_now()]
+
     # ------------------------------------------------------------------ one frame
 
-    def _force(self, motion: Motion) -> VisionForceSample:
+    def _force(self, motion: InstantMotion) -> VisionForceSample:
         frame = self._waiting.popleft()
         x_um, v_um_s = self._compression(motion)
         seen_uN = self._seen_sigma_uN(motion, x_um, v_um_s)
@@ -147,7 +150,7 @@ class VisionForce:
         sigma_uN = math.hypot(noise_uN, self._model_sigma_uN(x_um, v_um_s))
         return self._publish(frame, max(raw_uN, 0.0), sigma_uN, motion.velocity_um_s, flags)
 
-    def _rests_on_its_way_back(self, motion: Motion) -> bool:
+    def _rests_on_its_way_back(self, motion: InstantMotion) -> bool:
         v_um_s = motion.velocity_um_s
         self._fastest_um_s = max(self._fastest_um_s, abs(v_um_s))
         if abs(v_um_s) > max(_MOVES_SIGMAS * motion.velocity_sigma_um_s, _MOVES_SHARE * self._fastest_um_s):
@@ -155,7 +158,7 @@ class VisionForce:
             return False
         return self._came_back
 
-    def _compression(self, motion: Motion) -> tuple[float, float]:
+    def _compression(self, motion: InstantMotion) -> tuple[float, float]:
         """Compression x of eq. (21), µm, and its rate, µm/s, by eq. (26)."""
         x_um, v_um_s = motion.position_um - self.model.contact_um, motion.velocity_um_s
         if self._touched_ns is None or self.model.slip_um == 0.0:
@@ -165,7 +168,7 @@ class VisionForce:
 
     # ------------------------------------------------------------------ uncertainty
 
-    def _seen_sigma_uN(self, motion: Motion, x_um: float, v_um_s: float) -> float:
+    def _seen_sigma_uN(self, motion: InstantMotion, x_um: float, v_um_s: float) -> float:
         """Standard deviation from the noise of the deformation and of the velocity."""
         damper = self._damper(v_um_s)
         from_velocity = damper * motion.velocity_sigma_um_s if damper else 0.0
@@ -184,7 +187,7 @@ class VisionForce:
         terms = zip((p * q for p in slope for q in slope), self.model.covariance, strict=True)
         return math.sqrt(max(sum(weight * value for weight, value in terms), 0.0))
 
-    def _is_outside(self, motion: Motion, x_um: float, v_um_s: float) -> bool:
+    def _is_outside(self, motion: InstantMotion, x_um: float, v_um_s: float) -> bool:
         deeper = x_um - _RANGE_SIGMAS * motion.sigma_um > self.model.deepest_um
         fastest_um_s = self.model.fastest_um_s if v_um_s > 0.0 else self.model.fastest_unloading_um_s
         return deeper or abs(v_um_s) - _RANGE_SIGMAS * motion.velocity_sigma_um_s > fastest_um_s
@@ -214,10 +217,10 @@ class _Lag:
     """
 
     def __init__(self, window: int) -> None:
-        self._told: deque[Motion] = deque(maxlen=window)
+        self._told: deque[InstantMotion] = deque(maxlen=window)
         self._change_um_s2: deque[float] = deque(maxlen=2 * window)
 
-    def hidden_um_s(self, motion: Motion) -> float:
+    def hidden_um_s(self, motion: InstantMotion) -> float:
         """Standard deviation of that, for the next motion told."""
         if self._told and self._told[-1].begin_ns != motion.begin_ns:
             self._told.clear()

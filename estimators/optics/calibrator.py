@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol, cast
 
 from microdrivers.core.errors import IllConditioned
 from microdrivers.core.samples import Frame, OpticsEstimate, Sample, TrackedPoint, XYThetaSample, ZoomSample
-from microdrivers.core.synchroniser import Around, PoseAt, Synchroniser, interpolate_pose
+from microdrivers.core.synchroniser import PoseAt, Synchroniser, interpolate_pose
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.optics.optical_parameters import OpticalParameters, optical_parameters
 from microdrivers.estimators.optics.recursion import ProjectionRecursion
@@ -105,12 +105,13 @@ class OpticsCalibrator:
             else:
                 self.lost_frames += 1
         for matched, neighbours in self._synchroniser.release():
-            zooms = cast("Around[ZoomSample]", neighbours["zoom"])
-            pose = interpolate_pose(cast("Around[XYThetaSample]", neighbours["stage"]), matched.t_ns)
+            before, after = cast("tuple[XYThetaSample, XYThetaSample]", neighbours["stage"])
+            zooms = cast("tuple[ZoomSample, ZoomSample]", neighbours["zoom"])
+            pose = interpolate_pose(before, after, matched.t_ns)
             if pose.gap_ns > self.settings.max_pose_gap_s * NS_PER_S:
                 self.skipped_frames += 1
             else:
-                results.append(self._estimate(matched, pose, zooms.before, zooms.after))
+                results.append(self._estimate(matched, pose, *zooms))
         return results
 
     # ------------------------------------------------------------------ one frame

@@ -98,7 +98,6 @@ class DeformationTracker:
         scale: of the image; from the probe's own travel if None.
         max_speed_um_s: no faster do tip and contact point move; what is found farther away is something else.
         min_correlation: below this correlation coefficient, 0 … 1, a patch is lost.
-        contact: detects the touch; a `VisualContact` of its own if None.
 
     Attributes:
         contact: what detects the touch; its `event` is None before.
@@ -117,7 +116,6 @@ class DeformationTracker:
         scale: ImageScale | None = None,
         max_speed_um_s: float = 1000.0,
         min_correlation: float = MIN_CORRELATION,
-        contact: VisualContact | None = None,
     ) -> None:
         check_range(max_speed_um_s, Range(1.0, 1e6), what="max_speed_um_s", unit="µm/s")
         check_range(min_correlation, Range(0.1, 1.0), what="min_correlation", unit="(1 is a perfect match)")
@@ -132,7 +130,7 @@ class DeformationTracker:
         self._tip_zero_um = float(self._row @ patch.tip_shift) + patch.gap_px / self._scale.px_per_um
         self._by_sight = True
         self._seq = 0
-        self.contact = VisualContact() if contact is None else contact
+        self.contact = VisualContact()
         self.last_reason = ""
 
     @property

@@ -22,19 +22,44 @@ from microdrivers.estimators.vision.template import MARGIN_PX, Float32Array, Flo
 
 MissReason = Literal["no_tip", "no_specimen", "no_texture", "too_small", "at_border", "saturated", "unsteady"]
 
+_SEARCH_UM = 500.0
+"""How far ahead of the tip the specimen is looked for, and the tip about its last place."""
+
+_MAX_SIGMA_PX = 0.03
+"""Largest standard deviation of the displacement in one frame."""
+
 _SMOOTHING_PX = 1.0
+"""Standard deviation of the blur before slopes are taken."""
+
 _TEXTURE_SIGMAS = 3.0
+"""Standard deviations of the noise's slope beyond which a slope is texture."""
+
 _TEXTURED_SHARE = 0.5
-_TIP_EDGE_PX = 4
-_CLEAR_PX = 4
+"""Of the corridor's width: where more is texture, there is specimen."""
+
+_TIP_EDGE_PX, _CLEAR_PX = 4, 4
+"""Ahead of the front: what still shows the tip's own edge, and what must be clear beyond it to look straight ahead."""
+
 _LEAST_GAP_PX = 3
-_RIM_PX = 4.0
-_RIM_SHARE = 0.12
+"""Texture may be interrupted by that, or by a fifth of the length that it must have."""
+
+_RIM_PX, _RIM_SHARE = 4.0, 0.12
+"""Behind the surface, also as a share of the disc's radius: what is left out for the tip and what shows beside it."""
+
 _MIN_REACH_PX = 10.0
+"""Radius of the smallest disc."""
+
 _MIN_KEPT = 0.5
+"""Of the disc's area: what must be in view, and of that, what must not be saturated."""
+
 _SATURATED_LEVELS = 2
+"""Grey levels below the top one from which on a mean of frames is taken for saturated."""
+
 _MUCH_WHITE = 0.02
+"""Of the image: where more is white, light is why no specimen is seen."""
+
 _UNSTEADY_PX = 0.1
+"""What a specimen at rest may seem to move by, besides five standard deviations."""
 
 _REMEDIES: dict[str, str] = {
     "no_tip": "find the tip anew: zoom, focus or light changed, or the probe left the view",
@@ -86,8 +111,6 @@ def contact_patch(
     gap_um: float | None = None,
     rigid_um: float = 100.0,
     depth_um: float = 150.0,
-    search_um: float = 500.0,
-    max_sigma_px: float = 0.03,
 ) -> ContactPatch:
     """Take the patch that will tell the contact point's displacement, from frames of the specimen at rest.
 
@@ -108,8 +131,6 @@ def contact_patch(
             looked for.
         rigid_um: what lies nearer to the contact point than this moves with it as one piece.
         depth_um: how far the contact point will be pressed in; so long the patch must stay in view.
-        search_um: how far ahead of the tip the specimen is looked for.
-        max_sigma_px: largest standard deviation of the displacement in one frame.
 
     Raises:
         OutOfRange: no frames, or a length is not positive.
@@ -118,54 +139,57 @@ def contact_patch(
     """
     if not frames:
         raise OutOfRange("no frames", remedy="give one frame of the undeformed specimen at least, better ten")
-    for name, value in (("rigid_um", rigid_um), ("depth_um", depth_um), ("search_um", search_um)):
+    for name, value in (("rigid_um", rigid_um), ("depth_um", depth_um)):
         check_range(value, Range(1.0, 1e4), what=name, unit="µm")
     raw = [require_grey(frame.image) for frame in frames]
-    found = _find_tip(tip, raw[-1], search_um)
+    found = _find_tip(tip, raw[-1])
     if found is None:
         raise NoContactPatch("no_tip", "the probe's tip is not seen in the frames of the undeformed specimen")
     images, noise = even_light(raw)
     mean = np.asarray(np.mean(images, axis=0), dtype=np.float32)
     front = tip.front_px + found.shift
-    gap = None if gap_um is None else gap_um * tip.scale_px_per_um
-    if gap is None:
-        gap = _gap_px(mean, front, tip, noise=noise / math.sqrt(len(raw)), search_px=search_um * tip.scale_px_per_um)
     white = _white(mean, 2 ** frames[-1].bit_depth - 1)
-    if gap is None and white.mean() > _MUCH_WHITE:
-        raise NoContactPatch("saturated", "no texture ahead of the tip, and much of the image is white")
-    if gap is None:
-        raise NoContactPatch("no_specimen", f"no texture within {search_um:.0f} µm ahead of the tip")
+    if gap_um is None:
+        gap = _require_gap_px(mean, front, tip, noise=noise / math.sqrt(len(raw)), white=white)
+    else:
+        gap = gap_um * tip.scale_px_per_um
     contact = front + gap * tip.direction
     reach = rigid_um * tip.scale_px_per_um
     if reach < _MIN_REACH_PX:
         raise NoContactPatch("too_small", f"{rigid_um:.0f} µm about the contact point are {reach:.1f} px only")
     mask = _mask(white, contact, tip.direction, reach)
     patch = take_patch(mean, mask, noise_levels=noise, noise_share=1.0 / len(raw), pivot_px=contact)
-    sigma = math.inf if patch is None else patch.sigma_px(noise, tip.direction)
-    if patch is None or sigma > max_sigma_px:
-        what = f"the displacement would be uncertain by {sigma:.2g} px a frame, more than {max_sigma_px:g} px"
-        raise NoContactPatch("no_texture", f"too little texture behind the contact point: {what}")
+    patch, sigma = _require_texture(patch, noise, tip.direction)
     if not patch.fits_in(mean.shape, depth_um * tip.scale_px_per_um * tip.direction):
         raise NoContactPatch("at_border", f"pressed in by {depth_um:.0f} µm, the contact point leaves the view")
     _require_rest(patch, raw)
     return ContactPatch(patch, contact, gap, found.shift, reach, noise, sigma)
 
 
-def _find_tip(tip: TipView, image: npt.NDArray[Any], search_um: float) -> PatchMatch | None:
+def _find_tip(tip: TipView, image: npt.NDArray[Any]) -> PatchMatch | None:
     """On its way first: there it is found even if the specimen lies at its front."""
-    reach_px = search_um * tip.scale_px_per_um
+    reach_px = _SEARCH_UM * tip.scale_px_per_um
     on_way = locate_along(tip.patch, image, tip.direction, start=np.zeros(2), back_px=0.5 * reach_px, ahead_px=reach_px)
     return on_way or locate(tip.patch, image, np.zeros(2), radius_px=float(max(image.shape)))
 
 
-def _gap_px(image: Float32Array, front: FloatArray, tip: TipView, *, noise: float, search_px: float) -> float | None:
+def _require_gap_px(image: Float32Array, front: FloatArray, tip: TipView, *, noise: float, white: BoolArray) -> float:
+    gap = _gap_px(image, front, tip, noise=noise)
+    if gap is None and white.mean() > _MUCH_WHITE:
+        raise NoContactPatch("saturated", "no texture ahead of the tip, and much of the image is white")
+    if gap is None:
+        raise NoContactPatch("no_specimen", f"no texture within {_SEARCH_UM:.0f} µm ahead of the tip")
+    return gap
+
+
+def _gap_px(image: Float32Array, front: FloatArray, tip: TipView, *, noise: float) -> float | None:
     """From the tip's front to the specimen's surface; None if there is none.
 
     Straight ahead if a clear stretch lies before the surface, otherwise from what shows on either side of the tip.
     """
     slope = _slope(image)
     limit = _TEXTURE_SIGMAS * max(noise, 0.3) / (2.0 * math.sqrt(2.0 * math.pi) * _SMOOTHING_PX**2)
-    half = max(3.0, 0.35 * tip.width_px)
+    half, search_px = max(3.0, 0.35 * tip.width_px), _SEARCH_UM * tip.scale_px_per_um
     ahead = _onset(slope, limit, front, tip, middle=0.0, half=half, start=float(_TIP_EDGE_PX), end=search_px)
     if ahead is None or ahead > _TIP_EDGE_PX + _CLEAR_PX:
         return ahead
@@ -243,6 +267,15 @@ def _mask(white: BoolArray, contact: FloatArray, direction: FloatArray, reach_px
     if kept.sum() < MIN_PIXELS:
         raise NoContactPatch("too_small", f"the patch behind the contact point has {kept.sum()} pixels only")
     return np.asarray(kept)
+
+
+def _require_texture(patch: Patch | None, noise_levels: float, direction: FloatArray) -> tuple[Patch, float]:
+    """The patch, and the standard deviation of the displacement that it gives."""
+    sigma = math.inf if patch is None else patch.sigma_px(noise_levels, direction)
+    if patch is None or sigma > _MAX_SIGMA_PX:
+        what = f"the displacement would be uncertain by {sigma:.2g} px a frame, more than {_MAX_SIGMA_PX:g} px"
+        raise NoContactPatch("no_texture", f"too little texture behind the contact point: {what}")
+    return patch, sigma
 
 
 def _require_rest(patch: Patch, images: Sequence[npt.NDArray[Any]]) -> None:

@@ -13,16 +13,28 @@ import numpy.typing as npt
 
 from microdrivers.core.errors import DataError
 from microdrivers.estimators.vision.patch import BoolArray
-from microdrivers.estimators.vision.template import Float32Array, FloatArray
+from microdrivers.estimators.vision.template import ROUNDING_VARIANCE, Float32Array, FloatArray
 
 _BLOCK_PX = 8
+"""Side of the blocks over which grey levels are averaged."""
+
 _SMOOTHING_PX = 1.0
+"""Standard deviation of the blur before images are compared."""
+
 _SIGMAS = 6.0
+"""Standard deviations of the noise, after the blur, beyond which a pixel has changed."""
+
 _CLOSING_PX = 7
+"""Gaps in what changed that are closed."""
+
 _MIN_REGION_PX = 20
+"""Pixels of the smallest region that is no noise."""
+
 _SURROUNDING_PX = 6
+"""Beyond the region: what is looked for together with it."""
+
 _LENGTH_RANGE = (0.5, 1.7)
-_ROUNDING_VARIANCE = 1.0 / 12.0
+"""Displacements that count, relative to the one expected."""
 
 
 class EvenSeries(NamedTuple):
@@ -53,7 +65,7 @@ def even_light(images: Sequence[npt.NDArray[Any]]) -> EvenSeries:
     else:
         rough = last - cv2.GaussianBlur(last, (0, 0), _SMOOTHING_PX)
         noise_variance = float(np.median(_blocks(rough * rough)))
-    return EvenSeries(even, math.sqrt(max(noise_variance, _ROUNDING_VARIANCE)))
+    return EvenSeries(even, math.sqrt(max(noise_variance, ROUNDING_VARIANCE)))
 
 
 def changed_region(before: Float32Array, after: Float32Array, noise_levels: float) -> BoolArray | None:

@@ -21,17 +21,31 @@ from microdrivers.estimators.vision.tip_front import FLANK_PX, TipFront, find_fr
 MissReason = Literal["nothing_moved", "not_the_probe", "too_little_shape", "at_border", "does_not_follow"]
 
 MIN_FRAMES = 3
+"""Frames that a line through the tip's places takes, its scatter included."""
+
 MIN_DISPLACEMENT_PX = 6.0
+"""Of the tip between the first and the last frame."""
 
 _MIN_CORRELATION = 0.6
-_KEPT_BEHIND_PX = 60.0
-_AHEAD_PX = 5.0
+"""Of what changed, and of the tip in each frame, with itself in the last."""
+
+_KEPT_BEHIND_PX, _AHEAD_PX = 60.0, 5.0
+"""Length of the tip's end that is tracked, behind its front and ahead of it."""
+
 _BEHIND_PX = 4.0
+"""Behind the front begins what the front does not show in."""
+
 _SUFFICIENT_PX = 0.04
-_BESIDE_PX = 3
-_SLACK_PX = 2
+"""Standard deviation of the shift in one frame, with which marks behind the front do."""
+
+_BESIDE_PX, _SLACK_PX = 3, 2
+"""Beside the tip: what is taken for its edges; and what is left besides at the image's border."""
+
 _MAX_RESIDUAL_PX = 0.3
+"""RMS by which a tip that follows its travel may scatter about it, both axes together."""
+
 _RESTLESS_SIGMAS = 3.0
+"""Standard deviations of the noise: what scatters more from frame to frame does not move along with the tip."""
 
 _REMEDIES: dict[str, str] = {
     "nothing_moved": "move the probe farther between the first and the last frame, and look whether its tip is in view",
@@ -61,9 +75,8 @@ class TipView(NamedTuple):
         direction: of the approach in the image, a unit vector (u, v).
         width_px: of the tip near its front.
         scale_px_per_um: displacement in the image per µm of the encoder's travel.
-        scale_sigma_px_per_um, direction_sigma_rad: standard deviations of these.
+        scale_sigma_px_per_um: its standard deviation.
         travel_um: the encoder's travel at which the patch's shift is zero.
-        residual_px: RMS of what the straight line through the displacements leaves, both axes together.
         frames: how many frames took part.
     """
 
@@ -73,9 +86,7 @@ class TipView(NamedTuple):
     width_px: float
     scale_px_per_um: float
     scale_sigma_px_per_um: float
-    direction_sigma_rad: float
     travel_um: float
-    residual_px: float
     frames: int
 
 
@@ -267,7 +278,6 @@ def _fit(
         raise NoMovingTip("does_not_follow", f"the tip's displacements scatter by {rms:.2f} px about its travel")
     scale = float(np.hypot(line[2], line[3]))
     direction = line[2:] / scale
-    across = np.array([-direction[1], direction[0]])
     return TipView(
         patch=patch,
         front_px=front.point,
@@ -275,8 +285,6 @@ def _fit(
         width_px=front.width_px,
         scale_px_per_um=scale,
         scale_sigma_px_per_um=math.sqrt(float(direction @ covariance[2:, 2:] @ direction)),
-        direction_sigma_rad=math.sqrt(float(across @ covariance[2:, 2:] @ across)) / scale,
         travel_um=-float(direction @ line[:2]) / scale,
-        residual_px=rms,
         frames=len(found),
     )

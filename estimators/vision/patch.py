@@ -15,11 +15,14 @@ import numpy.typing as npt
 
 from microdrivers.estimators.vision.template import (
     MARGIN_PX,
+    MIN_INDEPENDENCE,
+    ROUNDING_VARIANCE,
     Float32Array,
     FloatArray,
     interpolated,
     interpolator,
     product,
+    reduced,
 )
 
 BoolArray = npt.NDArray[np.bool_]
@@ -32,8 +35,6 @@ _CONVERGED_PX = 2e-3
 """The next step would be a tenth of it at most, where the patch fits."""
 
 _MAX_REFINEMENT_PX = 3.0
-_MIN_INDEPENDENCE = 1e-4
-_ROUNDING_VARIANCE = 1.0 / 12.0
 _PLAIN = np.eye(4)
 _SEARCH_SIZE_PX = 200
 _LEAST_SEARCHED_PX = 8
@@ -191,7 +192,7 @@ class Patch:
         squares = float((sampled * sampled).sum()) + unexplained
         # Interpolation evens out a part of the noise that the residuals show, but not of what moves the fit.
         smoothing = math.prod(float((interpolator(x) ** 2).sum()) for x in part.tolist())
-        noise = max(squares / (len(sampled) - count) / (smoothing + self._noise_share), _ROUNDING_VARIANCE)
+        noise = max(squares / (len(sampled) - count) / (smoothing + self._noise_share), ROUNDING_VARIANCE)
         variance = noise * (1.0 + self._noise_share) / gain**2
         return PatchMatch(
             shift=shift,
@@ -205,7 +206,7 @@ class Patch:
         """Top-left place (column, row) of the patch in `image`, both first reduced by a whole factor."""
         whole, chip, mask = image.astype(np.float32), self._chip, self._mask
         if reduction > 1:
-            whole, chip, mask = (_reduced(array, reduction) for array in (whole, chip, mask))
+            whole, chip, mask = (reduced(array, reduction) for array in (whole, chip, mask))
             mask = (mask > 0.5).astype(np.float32)
         scores = cv2.matchTemplate(whole, chip, cv2.TM_CCOEFF_NORMED, mask=mask)
         scores[~np.isfinite(scores) | (scores > 1.001)] = -1.0
@@ -306,17 +307,10 @@ def _independent(normal: FloatArray) -> bool:
     if not diagonal.min() > 0.0:
         return False
     lengths = np.sqrt(diagonal)
-    return bool(np.linalg.eigvalsh(normal / np.outer(lengths, lengths))[0] > _MIN_INDEPENDENCE)
+    return bool(np.linalg.eigvalsh(normal / np.outer(lengths, lengths))[0] > MIN_INDEPENDENCE)
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
     """Inverse of a normal matrix, its rows and columns first scaled to a diagonal of ones."""
     lengths = np.sqrt(np.diag(normal))
     return np.asarray(np.linalg.inv(normal / np.outer(lengths, lengths)) / np.outer(lengths, lengths))
-
-
-def _reduced(image: Float32Array, factor: int) -> Float32Array:
-    """Means over `factor` × `factor` pixels, on a grid that begins at the top-left pixel."""
-    rows, columns = image.shape[0] // factor, image.shape[1] // factor
-    whole = image[: rows * factor, : columns * factor]
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)

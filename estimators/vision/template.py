@@ -18,6 +18,12 @@ MIN_HALF_PX = 12
 MARGIN_PX = 3
 """Pixels around the window that interpolation needs."""
 
+MIN_INDEPENDENCE = 1e-4
+"""Least eigenvalue of the products of a model's rows, all of unit length: below it they cannot be told apart."""
+
+ROUNDING_VARIANCE = 1.0 / 12.0
+"""Of grey levels, in their squares: no image has less noise."""
+
 _TAPS = 6
 _NODES = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
 _LAGRANGE = np.linalg.inv(np.vander(_NODES, increasing=True)).T
@@ -30,8 +36,6 @@ _CONVERGED_PX = 1e-4
 _MAX_REFINEMENT_PX = 2.5
 _SMOOTHING_PX = 1.5
 _STRUCTURE_RATIO = 3.0
-_MIN_INDEPENDENCE = 1e-4
-_ROUNDING_VARIANCE = 1.0 / 12.0
 
 
 class Match(NamedTuple):
@@ -72,7 +76,7 @@ class Template:
         self._chip_half = np.array(_chip_half(half))
         self._chip = np.ascontiguousarray(_window(image, centre, _chip_half(half)))
         self._reduction = int(min(_MAX_REDUCTION, max(1, min(image.shape) // _COARSE_ROWS)))
-        self._coarse_chip = _reduced(self._chip, self._reduction)
+        self._coarse_chip = reduced(self._chip, self._reduction)
 
         normal = rows @ rows.T
         self._rows = rows[:4]
@@ -88,7 +92,7 @@ class Template:
         if f == 1:
             place, peak = _best_place(image, self._chip)
         else:
-            coarse, _ = _best_place(_reduced(image, f), self._coarse_chip)
+            coarse, _ = _best_place(reduced(image, f), self._coarse_chip)
             low = np.maximum(coarse * f - f - 1, 0)
             high = coarse * f + np.array(self._chip.shape[::-1]) + f + 1
             region = image[low[1] : high[1], low[0] : high[0]]
@@ -129,7 +133,7 @@ class Template:
         total = len(residuals) * float(sampled.var())
         correlation = math.sqrt(max(0.0, 1.0 - squares / total)) if total > 0.0 else 0.0
         gain = float(fitted[2])
-        variance = max(squares / (len(residuals) - 4), _ROUNDING_VARIANCE) / gain**2
+        variance = max(squares / (len(residuals) - 4), ROUNDING_VARIANCE) / gain**2
         affine = product(self._deformation, sampled) / gain
         return Match(
             shift=shift,
@@ -177,7 +181,7 @@ def _window(image: Float32Array, centre: tuple[int, int], half: tuple[int, int])
     return image[v - b : v + b + 1, u - a : u + a + 1]
 
 
-def _reduced(image: Float32Array, factor: int) -> Float32Array:
+def reduced(image: Float32Array, factor: int) -> Float32Array:
     """Means over `factor` × `factor` pixels, on a grid that begins at the top-left pixel."""
     rows, columns = image.shape[0] // factor, image.shape[1] // factor
     whole = image[: rows * factor, : columns * factor]
@@ -210,7 +214,7 @@ def take_template(image: Float32Array, *, centre: tuple[int, int], half: tuple[i
     if not lengths.min() > 0.0:
         return None
     unit = rows / lengths[:, None]
-    if np.linalg.eigvalsh(unit @ unit.T)[0] < _MIN_INDEPENDENCE:
+    if np.linalg.eigvalsh(unit @ unit.T)[0] < MIN_INDEPENDENCE:
         return None
     return Template(image, rows, centre=centre, half=half)
 
@@ -230,7 +234,7 @@ def _model_rows(image: Float32Array, centre: tuple[int, int], half: tuple[int, i
 def _has_structure(patch: FloatArray) -> bool:
     """Whether `patch` varies along both axes by more than white noise does after smoothing."""
     smooth = cv2.GaussianBlur(patch, (0, 0), _SMOOTHING_PX)
-    noise_variance = float(np.var(patch - smooth)) + _ROUNDING_VARIANCE
+    noise_variance = float(np.var(patch - smooth)) + ROUNDING_VARIANCE
     by_v, by_u = np.gradient(smooth)
     weakest = float(np.linalg.eigvalsh(np.cov(by_u.ravel(), by_v.ravel()))[0])
     return weakest > _STRUCTURE_RATIO * noise_variance / (8.0 * math.pi * _SMOOTHING_PX**4)

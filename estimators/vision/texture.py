@@ -17,6 +17,9 @@ from microdrivers.estimators.vision.template import (
     take_template,
 )
 
+_MAX_DEFORMATION = 0.005
+"""Largest change of length or angle across the window: 0.5 % or 0.3°."""
+
 
 class TextureTracker:
     """Tracks a point by the natural texture around it, to about a hundredth of a pixel.
@@ -35,7 +38,6 @@ class TextureTracker:
         window: size of the template as a share of the image along each axis, 0.05 … 0.9. A larger one is more
             precise, a smaller one leaves more room: the point may move by (1 − window)/2 of the image.
         min_correlation: below this correlation coefficient the target is lost.
-        max_deformation: largest change of length or angle across the window; 0.005 is 0.5 % or 0.3°.
         device: name under which the points are published.
 
     Attributes:
@@ -52,7 +54,6 @@ class TextureTracker:
         point_px: tuple[float, float] = (0.0, 0.0),
         window: float = 0.4,
         min_correlation: float = 0.7,
-        max_deformation: float = 0.005,
         device: str = "texture_tracker",
     ) -> None:
         check_range(window, Range(0.05, 0.9), what="window", unit="of the image")
@@ -60,7 +61,6 @@ class TextureTracker:
         self._point_px = point_px
         self._window = window
         self._min_correlation = min_correlation
-        self._max_deformation = max_deformation
         self._reporter = PointReporter(device)
         self.last_reason = ""
         self.last_match: Match | None = None
@@ -103,7 +103,7 @@ class TextureTracker:
         match = template.refine(image, shift)
         if match is None or match.correlation < self._min_correlation:
             return self._lose_sight(frame, peak if match is None else match.correlation)
-        if match.deformation > max(self._max_deformation, 5.0 * match.deformation_sigma):
+        if match.deformation > max(_MAX_DEFORMATION, 5.0 * match.deformation_sigma):
             change = f"lengths or angles changed by {100 * match.deformation:.2g} % since the template was taken"
             return self._lose(frame, "appearance_changed", change)
         self._leaving = False

@@ -4,24 +4,51 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from itertools import takewhile
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from microdrivers.core.contact_samples import DeformationSample
-from microdrivers.core.units import NS_PER_S, Range, check_range
+from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.vision.template import FloatArray
 
 _HISTORY = 120
+"""Frames that are remembered: 4 s at 30 Hz."""
+
 _REST_FRAMES = 5
+"""Frames that show what rest is, at least."""
+
 _REST_GAP = 5
-_RISEN_SIGMAS = 5.0
+"""Frames before a rise that may belong to it already, and do not count as rest."""
+
+_THRESHOLD, _SLACK = 12.0, 1.0
+"""Alarm of the sum, and deformation a frame that counts as none, in standard deviations; white noise exceeds them once
+in 1e9 frames."""
+
+_RISEN_SIGMAS, _CONFIRM_FRAMES = 5.0, 6
+"""So many frames in a row must show a deformation beyond so many standard deviations, for the place to be found."""
+
+_CONFIRM_SIGMAS = 15.0
+"""Deformation, in standard deviations, at least, at which the event comes."""
+
 _BEGUN = 0.3
-_TOGETHER = 0.4
+"""Share of the newest deformation above which a frame belongs to the rise for sure."""
+
+_TOGETHER, _TOGETHER_SIGMAS = 0.4, 3.0
+"""Share of the way, and standard deviations besides, by which specimen and tip may differ and still go together."""
+
 _LONGEST = 60
-_TOGETHER_SIGMAS = 3.0
+"""Frames after which a rise must have proved to be the tip's."""
+
+_KEPT = 30
+"""Frames of a rise that was not the tip's which show the new rest."""
+
 _MOVING_SIGMAS = 3.0
+"""Of a speed that is none of noise."""
+
 _ROUNDS = 20
+"""Most repetitions of the fit of the place; each changes which frames lie after the touch."""
 
 
 class ContactEvent(NamedTuple):
@@ -47,36 +74,16 @@ class ContactEvent(NamedTuple):
 class VisualContact:
     """Detects the touch while the tip comes nearer: the contact point, at rest until then, moves along with it.
 
-    A cumulative sum of the deformation against its mean at rest, in units of its own standard deviation, less
-    `slack` a frame (Page's test), raises the alarm. The place follows from the frames since the sum left zero:
-    deformation = max(0, tip − place). A specimen that moves without the tip, or otherwise than it, is no contact.
-
-    Args:
-        threshold: of the sum; with slack 1, white noise exceeds 12 once in 1e9 frames.
-        slack: deformation per frame, in standard deviations, that counts as none.
-        confirm_frames: how many frames in a row must show a deformation of more than five standard deviations, before
-            the event comes; the place is found from them.
-        confirm_sigmas: deformation, in standard deviations, at least, at which it comes.
+    A cumulative sum of the deformation against its mean at rest, in units of its own standard deviation, raises the
+    alarm (Page's test). The place follows from the frames since the sum left zero: deformation = max(0, tip − place).
+    A specimen that moves without the tip, or otherwise than it, is no contact; where it then lies is its new rest. A
+    touch shows from about 0.14 standard deviations of deformation a frame on.
 
     Attributes:
         event: the touch; None before.
     """
 
-    def __init__(
-        self,
-        *,
-        threshold: float = 12.0,
-        slack: float = 1.0,
-        confirm_frames: int = 6,
-        confirm_sigmas: float = 15.0,
-    ) -> None:
-        check_range(threshold, Range(1.0, 1e3), what="threshold", unit="(standard deviations)")
-        check_range(slack, Range(0.1, 10.0), what="slack", unit="(standard deviations)")
-        check_range(confirm_frames, Range(3, _HISTORY // 2), what="confirm_frames", unit="frames")
-        self._threshold = threshold
-        self._slack = slack
-        self._confirm_frames = confirm_frames
-        self._confirm_sigmas = confirm_sigmas
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -97,28 +104,41 @@ class VisualContact:
             return None
         rest, rest_sigma = self._rest(resting)
         sigma = math.hypot(sample.sigma_um, rest_sigma)
-        self._sum = max(0.0, self._sum + (sample.deformation_um - rest) / sigma - self._slack)
+        self._sum = max(0.0, self._sum + (sample.deformation_um - rest) / sigma - _SLACK)
         self._moving = self._moving + 1 if self._sum > 0.0 else 0
         risen = (sample.deformation_um - rest) / sigma
         self._risen = self._risen + 1 if risen > _RISEN_SIGMAS else 0
-        if self._sum < self._threshold or self._risen < self._confirm_frames or risen < self._confirm_sigmas:
-            return None
-        verdict = self._moves_along(rest)
-        if verdict == "undecided":
-            return None
-        if verdict == "otherwise":
-            self._samples.clear()
-            self._sum, self._moving, self._risen = 0.0, 0, 0
-            return None
-        self.event = self._place(rest, rest_sigma)
+        if self._sum >= _THRESHOLD and self._risen >= _CONFIRM_FRAMES and risen >= _CONFIRM_SIGMAS:
+            verdict = self._moves_along(rest)
+            if verdict == "along":
+                self.event = self._place(rest, rest_sigma)
+            elif verdict == "otherwise":
+                self._rest_anew(kept=0)
+        elif self._moving >= _HISTORY - _REST_FRAMES or (self._moving > _LONGEST and not self._keeps_up(rest)):
+            self._rest_anew(kept=_KEPT)
         return self.event
+
+    def _rest_anew(self, *, kept: int) -> None:
+        """Take the newest frames for rest."""
+        self._samples = deque([*self._samples][len(self._samples) - kept :], maxlen=_HISTORY)
+        self._sum, self._moving, self._risen = 0.0, 0, 0
+
+    def _keeps_up(self, rest: float) -> bool:
+        """Whether the specimen has come about as far as the tip has since the sum left zero."""
+        newest = self._recent()[-_REST_FRAMES:]
+        risen = float(np.mean([sample.deformation_um for sample in newest])) - rest
+        came = float(np.mean([sample.tip_um for sample in newest])) - self._samples[-1 - self._moving].tip_um
+        allowance = _TOGETHER_SIGMAS * math.hypot(newest[-1].sigma_um, newest[-1].tip_sigma_um)
+        return abs(came - risen) < _TOGETHER * abs(risen) + allowance
 
     def _moves_along(self, rest: float) -> Literal["along", "otherwise", "undecided"]:
         """Whether the specimen has moved as the tip has since the sum left zero."""
         recent = self._recent()
         first, last = self._samples[-1 - self._moving], recent[-1]
         risen = last.deformation_um - rest
-        begun = next(sample for sample in recent if sample.deformation_um - rest > _BEGUN * risen)
+        # Not the first such frame: an earlier push may have come near it.
+        rise = takewhile(lambda sample: sample.deformation_um - rest > _BEGUN * risen, reversed(recent))
+        begun = [*rise][-1]
         further = last.deformation_um - begun.deformation_um
         allowance = _TOGETHER_SIGMAS * math.sqrt(2.0) * math.hypot(last.sigma_um, last.tip_sigma_um)
         if abs(further) < allowance / _TOGETHER and self._moving < _LONGEST:

@@ -24,7 +24,7 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
 
     RUNS are recordings, or folders with some in or below them. Optical calibrations and force characterisations are
     estimated anew from what was recorded. A file that cannot be analysed has a row that says why; the exit status
-    is 1 if that is so of all of them. After Ctrl-C or a kill, the same command goes on where it was.
+    is 1 if that is so of all of them. After Ctrl-C or a kill, run the same command again to resume.
 
     \b
     Examples:
@@ -44,7 +44,7 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
         )  # fmt: skip
     except KeyboardInterrupt:
         progress.close()
-        click.echo(f"interrupted; the same command goes on where it was ({out}.journal)", err=True)
+        click.echo(f"interrupted; run the same command again to resume ({out}.journal)", err=True)
         sys.exit(EXIT_INTERRUPTED)
     finally:
         progress.close()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from microdrivers.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK
-from microdrivers.cli.options import FiniteRange, given, refuse_options_given
+from microdrivers.cli.options import FiniteRange, fields_given, given, refuse_options_given
 from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 from microdrivers.cli.run_output import RESULT, RecordingChoice, RunOutput, recording_options
@@ -20,8 +20,13 @@ if TYPE_CHECKING:
     from microdrivers.estimators.optics.calibrator import CalibratorSettings
     from microdrivers.routines.optics.source import OpticsSource
 
-OF_ANALYSIS = ("frames", "forgetting", "flush_frames", "drift_um_s")
+_SETTINGS = {"forgetting": "forgetting", "flush_frames": "flush_frames", "drift_um_s": "sigma_drift_um_s"}
+"""Which field of the estimator's settings an option sets."""
+
+OF_ANALYSIS = ("frames", *_SETTINGS)
 """Options of the analysis: they may be tried on old data too."""
+
+REPLAY_HELP = "A run.mcap: the same estimator on what it recorded, set as in that run unless options say otherwise."
 
 
 @click.command(short_help="Camera to stage, through a zoom change.")
@@ -30,7 +35,7 @@ OF_ANALYSIS = ("frames", "forgetting", "flush_frames", "drift_um_s")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which simulated world to draw.")
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option("--images", type=click.Path(path_type=Path), help="Folder with frames.csv: a recorded image sequence.")
-@click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimator on what it recorded.")
+@click.option("--replay", type=click.Path(path_type=Path), help=REPLAY_HELP)
 @recording_options
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-optics/.")
 @click.option("--radius-um", type=float, help="Radius of the circle; default: up to 300, as large as fits the view.")
@@ -149,7 +154,10 @@ def _from_recording(file: Path, frames: int | None, settings: CalibratorSettings
 
     with Recording(file) as recording:
         tell_flaws(recording)
-        return _run(OpticsReplay(recording, frames=frames), settings, describe_recorded(recording), output)
+        source = OpticsReplay(recording, frames=frames)
+        if source.past_settings is not None:
+            settings = source.past_settings._replace(**fields_given(settings, _SETTINGS))
+        return _run(source, settings, describe_recorded(recording), output)
 
 
 def _on_rig(

@@ -12,22 +12,27 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.options import refuse_options_given
+from microdrivers.cli.options import fields_given, refuse_options_given
 from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws, write_results
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 from microdrivers.cli.run_output import RESULT, RecordingChoice, RunOutput, recording_options
+from microdrivers.core.protocol_names import PROTOCOLS
 
 if TYPE_CHECKING:
+    from microdrivers.core.protocol_names import ProtocolName
     from microdrivers.estimators.force.identify import IdentificationSettings
-    from microdrivers.estimators.force.protocols import ProtocolName
     from microdrivers.report.force_truth import ContactTruthCollector
     from microdrivers.results.force import ForceResult
     from microdrivers.routines.force import Characterisation, ForceRun, IndentationSource
 
 RECORD = "record.csv"
-PROTOCOLS = ("single", "unloading_springs", "loading_only", "slip_corrected", "loading")
-OF_ANALYSIS = ("leave_out", "protocol")
+_SETTINGS = {"leave_out": "around_reversal", "protocol": "protocol"}
+"""Which field of the identification's settings an option sets."""
+
+OF_ANALYSIS = tuple(_SETTINGS)
 """Options of the analysis: they may be tried on old data too."""
+
+REPLAY_HELP = "A run.mcap: the same estimators on what it recorded, set as in that run unless options say otherwise."
 _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else in its way?"
 
 
@@ -38,7 +43,7 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
 @click.option("--world", type=click.Path(path_type=Path), help="World file of the simulation.")
 @click.option("--specimen", metavar="NAME", help="Preset of an emulated specimen; on hardware, a name for the result.")
 @click.option("--csv", "table", type=click.Path(path_type=Path), help="A recorded indentation instead of a rig.")
-@click.option("--replay", type=click.Path(path_type=Path), help="A run.mcap: the same estimators on what it recorded.")
+@click.option("--replay", type=click.Path(path_type=Path), help=REPLAY_HELP)
 @recording_options
 @click.option("--calibration", type=click.Path(path_type=Path), help="result.json of `calibrate optics` for µm.")
 @click.option("--depth-um", type=float, default=110.0, show_default=True, help="How far to press, 5 to 1000.")
@@ -52,8 +57,7 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
 )  # fmt: skip
 @click.option(
     "--protocol", type=click.Choice(PROTOCOLS),
-    help="Whose model counts; default: within noise the likeliest, else that of the least error, the simpler one if "
-    "alike; a slip only if what slipped has stayed, and if it is determined or nothing else fits nearly as well.",
+    help="Protocol whose model is reported as best. Default: chosen automatically (see docs/recorded-indentations.md).",
 )  # fmt: skip
 @click.option("--yes", is_flag=True, help="Do not ask whether specimen and probe are ready.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where to write; default: runs/<time>-force/.")
@@ -125,7 +129,7 @@ def force(
 
 
 def _ask(rig_file: Path) -> None:
-    """Have the operator confirm; a rig file that is wrong, or states no force guard, is told before."""
+    """Have the operator confirm; a rig file that is wrong, or states no force guard, is reported before."""
     from microdrivers.rig import load_rig_file
 
     rig = load_rig_file(rig_file).rig
@@ -159,7 +163,10 @@ def _from_recording(file: Path, check: bool, settings: IdentificationSettings, o
 
     with Recording(file) as recording:
         tell_flaws(recording)
-        return _run(IndentationReplay(recording), describe_recorded(recording), check, settings, output)
+        source = IndentationReplay(recording)
+        if source.past_settings is not None:
+            settings = source.past_settings._replace(**fields_given(settings, _SETTINGS))
+        return _run(source, describe_recorded(recording), check, settings, output)
 
 
 def _from_table(file: Path, specimen: str | None, settings: IdentificationSettings, output: RunOutput) -> int:
@@ -263,7 +270,7 @@ def _tell_what_is_left(
 def _what_to_do_with(record: Path, tells_nothing: str) -> str:
     """What an experiment that failed has measured, and how it is analysed, unless it says nothing of a specimen."""
     if tells_nothing:
-        return f"what was measured is in {record}; nothing follows from it: {tells_nothing}"
+        return f"what was measured is in {record}; it cannot be analysed: {tells_nothing}"
     command = shlex.join(["microdrivers", "calibrate", "force", "--csv", str(record)])
     return f"what was measured is in {record}; to analyse it: {command}"
 

@@ -25,7 +25,7 @@ _FORMATS = ("csv", "parquet", "hdf5", "images", "video")
 )
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder to write to; default: FILE-export.")
 def export(file: Path, to: str, topics: tuple[str, ...], out: Path | None) -> None:
-    """Write the recording FILE in a format that other tools open. Nothing is written over.
+    """Write the recording FILE in a format that other tools open. Nothing is overwritten.
 
     csv and parquet: one table a topic, time_s since the recording's start, t_ns, then all fields, units in their
     names. hdf5: one file, for h5py and MATLAB, images included. images: numbered PNG files and frames.csv, which

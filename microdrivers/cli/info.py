@@ -44,6 +44,7 @@ def describe(recording: Recording) -> dict[str, Any]:
     """All that is known of a recording, as plain data."""
     import msgspec
 
+    from microdrivers.core.units import NS_PER_S
     from microdrivers.recording.views import start_ns
 
     begin_ns = start_ns(recording)
@@ -54,8 +55,8 @@ def describe(recording: Recording) -> dict[str, Any]:
             "sample_type": topic.sample_type.__name__,
             "count": topic.count,
             "rate_hz": topic.rate_hz if math.isfinite(topic.rate_hz) else None,
-            "first_s": (topic.first_t_ns - begin_ns) / 1e9 if topic.count else None,
-            "last_s": (topic.last_t_ns - begin_ns) / 1e9 if topic.count else None,
+            "first_s": (topic.first_t_ns - begin_ns) / NS_PER_S if topic.count else None,
+            "last_s": (topic.last_t_ns - begin_ns) / NS_PER_S if topic.count else None,
             "missing": topic.gaps,
             "dropped": topic.dropped,
             "unsorted": topic.unsorted,

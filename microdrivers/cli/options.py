@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import click
@@ -40,6 +40,11 @@ class FiniteRange(click.FloatRange):
 def given(name: str) -> bool:
     """Whether the user has given that parameter of the present command."""
     return click.get_current_context().get_parameter_source(name) is ParameterSource.COMMANDLINE
+
+
+def fields_given(settings: object, options: Mapping[str, str]) -> dict[str, Any]:
+    """Those fields of some settings that the user has given, by the options that set them."""
+    return {field: getattr(settings, field) for option, field in options.items() if given(option)}
 
 
 def refuse_options_given(reason: str, *, allowed: Collection[str], of_analysis: Collection[str] = ()) -> None:

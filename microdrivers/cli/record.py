@@ -121,7 +121,7 @@ def record(
     unmet = _unmet(patterns or (), rig.bus.topics)
     if unmet:
         click.echo(f"there was no topic {_quoted(unmet)}: {_similar(unmet, rig.bus.topics)}", err=True)
-    if disturbance or unmet or recorder.dropped or recorder.failure is not None:
+    if disturbance or unmet or recorder.dropped or recorder.failure is not None or not recorder.complete:
         sys.exit(EXIT_ERROR)
 
 
@@ -165,21 +165,24 @@ def _rate_hz(device: Device[Any]) -> float:
 
 def _run(clock: Clock, recorder: Recorder, duration_s: float | None) -> None:
     """Wait until the time is over or the file cannot be written, and tell how it goes."""
+    from microdrivers.core.units import NS_PER_S
+
     live = sys.stderr.isatty()
     period_s = _LINE_PERIOD_S if live else _PLAIN_LINE_PERIOD_S
     begin_ns = before_ns = clock.now_ns()
     before: dict[str, int] = {}
     end_s = float("inf") if duration_s is None else duration_s
     try:
-        while (elapsed_s := (clock.now_ns() - begin_ns) / 1e9) < end_s and not recorder.stopped:
+        while (elapsed_s := (clock.now_ns() - begin_ns) / NS_PER_S) < end_s and not recorder.stopped:
             clock.sleep(min(_LOOK_PERIOD_S, end_s - elapsed_s))
             now_ns = clock.now_ns()
-            over = now_ns - begin_ns >= end_s * 1e9 or recorder.stopped
-            if now_ns - before_ns < period_s * 1e9 and not over:
+            over = now_ns - begin_ns >= end_s * NS_PER_S or recorder.stopped
+            if now_ns - before_ns < period_s * NS_PER_S and not over:
                 continue
             messages = {topic: count.messages for topic, count in recorder.counts.items()}
             width = shutil.get_terminal_size().columns - 1 if live else sys.maxsize
-            line = _line(recorder, messages, before, (now_ns - before_ns) / 1e9, (now_ns - begin_ns) / 1e9, width)
+            since_s, elapsed_s = (now_ns - before_ns) / NS_PER_S, (now_ns - begin_ns) / NS_PER_S
+            line = _line(recorder, messages, before, since_s, elapsed_s, width)
             click.echo(f"\r\x1b[2K{line}" if live else line, nl=not live, err=True)
             before, before_ns = messages, now_ns
     finally:
@@ -195,7 +198,7 @@ def _line(
     elapsed_s: float,
     width: int,
 ) -> str:
-    """How it goes, in at most so many columns: a line that is wrapped is not written over."""
+    """How it goes, in at most so many columns: a line that is wrapped would not be overwritten by the next."""
     from microdrivers.recording.channels import TRUTH_PREFIX
 
     rates = " · ".join(
@@ -226,10 +229,12 @@ def _cut(text: str, width: int) -> str:
 
 def _tell(recorder: Recorder, *, interrupted: bool, disturbance: str) -> None:
     how = "ended by you; the file is complete" if interrupted else "complete"
+    if not recorder.complete:
+        how = "interrupted before its end was written; `microdrivers recording repair` makes it whole"
     if recorder.failure is not None:
         how = f"could not be written all the time: {recorder.failure.strerror or recorder.failure}"
     if disturbance:
-        how = f"spoilt: while it was written {disturbance}"
+        how = disturbance
     click.echo(f"{recorder.file}: {recorder.size / 1e6:.1f} MB, {how}")
     width = max(map(len, recorder.counts), default=0)
     for topic, count in recorder.counts.items():

@@ -31,6 +31,8 @@ def repair(file: Path, out: Path | None) -> None:
         click.echo(f"  {topic:<{width}}  {number}")
     for damage in report.mended:
         click.echo(f"mended: {damage}")
+    for topic, number in report.backwards.items():
+        click.echo(f"kept as they are: {number} messages of {topic} whose log time is before their predecessor's")
     if not report.losses:
         click.echo("nothing was lost")
         return

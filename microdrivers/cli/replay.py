@@ -42,6 +42,7 @@ def replay(file: Path, speed: float | None) -> None:
       microdrivers replay run.mcap --speed 1     as it happened
     """
     from microdrivers.core.clock import SimulatedClock, SystemClock
+    from microdrivers.core.units import NS_PER_S
     from microdrivers.recording.playback import open_replay
 
     progress = TerminalProgress()
@@ -57,7 +58,7 @@ def replay(file: Path, speed: float | None) -> None:
                 playback.run(speed, on_progress=lambda done: progress.count(done, total, what="samples"))
             except KeyboardInterrupt:
                 interrupted = True
-            took_s = (clock.now_ns() - begin_ns) / 1e9
+            took_s = (clock.now_ns() - begin_ns) / NS_PER_S
             progress.close()
             width = max(map(len, playback.counts), default=0)
             for topic, number in playback.counts.items():

@@ -135,7 +135,7 @@ class RunOutput:
         if recorder is None:
             return []
         if recorder.disturbance:
-            return [f"The recording {RECORDING} is spoilt: while it was written {recorder.disturbance}."]
+            return [f"The recording {RECORDING} is {recorder.disturbance}."]
         if not (recorder.dropped or recorder.failure):
             return []
         why = f" ({recorder.failure.strerror or recorder.failure})" if recorder.failure is not None else ""
@@ -218,7 +218,7 @@ def _check_folder(folder: Path) -> None:
 
     if (folder / RESULT).exists():
         raise ConfigError(
-            f"a {RESULT} is there, and a result is never written over", file=str(folder),
+            f"a {RESULT} is already there, and a result is never overwritten", file=str(folder),
             remedy="choose another --out folder",
         )  # fmt: skip
     existed = folder.exists()

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from typing import Generic, NamedTuple
+from typing import Generic
 
 import msgspec
 
 from microdrivers.core.samples import Sample, SampleT, XYThetaSample
 from microdrivers.core.units import NS_PER_S
-
-_GENTLE = 0.25
-"""Of a step: a path that bends by less is a curve, one that bends by more starts, stops or turns."""
-
-
-class Around(NamedTuple, Generic[SampleT]):
-    """The samples on either side of an instant, and the one before them if there is one."""
-
-    before: SampleT
-    after: SampleT
-    earlier: SampleT | None = None
 
 
 class Neighbours(Generic[SampleT]):
@@ -38,15 +26,14 @@ class Neighbours(Generic[SampleT]):
         """Whether a sample at or after `t_ns` has come."""
         return bool(self._samples) and self._samples[-1].t_ns >= t_ns
 
-    def around(self, t_ns: int) -> Around[SampleT] | None:
+    def around(self, t_ns: int) -> tuple[SampleT, SampleT] | None:
         """The last sample at or before `t_ns` and the first at or after it; None if one of them is missing."""
         after: SampleT | None = None
-        backwards = reversed(self._samples)
-        for sample in backwards:
+        for sample in reversed(self._samples):
             if sample.t_ns == t_ns:
-                return Around(sample, sample)
+                return sample, sample
             if sample.t_ns < t_ns:
-                return Around(sample, after, next(backwards, None)) if after is not None else None
+                return (sample, after) if after is not None else None
             after = sample
         return None
 
@@ -67,50 +54,28 @@ class PoseAt(msgspec.Struct, frozen=True):
     gap_ns: int
 
 
-def interpolate_pose(around: Around[XYThetaSample], t_ns: int) -> PoseAt:
-    """The pose between two samples: on the parabola through the earlier one, too, where the path bends gently.
-
-    On a circle the chords lie inside: with two samples alone the stage's steps, and with them the magnification, come
-    out wrong by 27 parts in a million at 100 poses a second (docs/decisions/0002). Where a stage starts, stops or turns
-    between the samples, the pose is on the straight line.
+def interpolate_pose(before: XYThetaSample, after: XYThetaSample, t_ns: int) -> PoseAt:
+    """The pose on the straight line between two samples.
 
     Raises:
         ValueError: `t_ns` does not lie between them.
     """
-    before, after, _ = around
     gap_ns = after.t_ns - before.t_ns
     if not before.t_ns <= t_ns <= after.t_ns:
         raise ValueError("a pose is interpolated between its neighbours, never extrapolated")
     share = (t_ns - before.t_ns) / gap_ns if gap_ns else 0.0
     rate_per_s = NS_PER_S / gap_ns if gap_ns else 0.0
     dx_um, dy_um = after.x_um - before.x_um, after.y_um - before.y_um
-    bend_x_um, bend_y_um = _bend_um(around)
     return PoseAt(
         t_ns=t_ns,
         dt_ns=max(before.dt_ns, after.dt_ns),
-        x_um=before.x_um + share * dx_um - share * (1.0 - share) * bend_x_um,
-        y_um=before.y_um + share * dy_um - share * (1.0 - share) * bend_y_um,
+        x_um=before.x_um + share * dx_um,
+        y_um=before.y_um + share * dy_um,
         theta_deg=before.theta_deg + share * (after.theta_deg - before.theta_deg),
         velocity_x_um_s=dx_um * rate_per_s,
         velocity_y_um_s=dy_um * rate_per_s,
         gap_ns=gap_ns,
     )
-
-
-def _bend_um(around: Around[XYThetaSample]) -> tuple[float, float]:
-    """Half the second difference of x and y over the gap; nothing where there is no third sample or no gentle curve."""
-    before, after, earlier = around
-    if earlier is None or before is after:
-        return 0.0, 0.0
-    gap, past = after.t_ns - before.t_ns, before.t_ns - earlier.t_ns
-    step = after.x_um - before.x_um, after.y_um - before.y_um
-    # The step that would follow from the one before at the same velocity.
-    continued = (before.x_um - earlier.x_um) * gap / past, (before.y_um - earlier.y_um) * gap / past
-    change = step[0] - continued[0], step[1] - continued[1]
-    if math.hypot(*change) > _GENTLE * math.hypot(*step):
-        return 0.0, 0.0
-    share = gap / (gap + past)
-    return share * change[0], share * change[1]
 
 
 class Synchroniser(Generic[SampleT]):
@@ -138,7 +103,7 @@ class Synchroniser(Generic[SampleT]):
             self._waiting.popleft()
             self.unmatched += 1
 
-    def release(self) -> list[tuple[SampleT, dict[str, Around[Sample]]]]:
+    def release(self) -> list[tuple[SampleT, dict[str, tuple[Sample, Sample]]]]:
         """Samples whose instant is bracketed by every reference, oldest first, each with its neighbours.
 
         A sample older than all reference samples can never be bracketed: it is given up and counted.
@@ -146,7 +111,7 @@ class Synchroniser(Generic[SampleT]):
         released = []
         while self._waiting and all(stream.reached(self._waiting[0].t_ns) for stream in self._streams.values()):
             sample = self._waiting.popleft()
-            neighbours: dict[str, Around[Sample]] = {}
+            neighbours: dict[str, tuple[Sample, Sample]] = {}
             for name, stream in self._streams.items():
                 pair = stream.around(sample.t_ns)
                 if pair is not None:

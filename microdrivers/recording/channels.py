@@ -12,16 +12,20 @@ TRUTH_PREFIX = "truth/"
 _WIRE_SUFFIX = "/wire"
 
 
+def matches(topic: str, patterns: Collection[str] | None) -> bool:
+    """Whether a topic is one of those named, or matched by a pattern such as `truth/*`; None matches all."""
+    return patterns is None or any(fnmatchcase(topic, pattern) for pattern in patterns)
+
+
 def is_wanted(topic: str, patterns: Collection[str] | None) -> bool:
-    """Whether a topic is asked for: named, or matched by a pattern such as `truth/*`.
+    """Whether a topic is to be recorded: it matches.
 
     None asks for all but the bytes on the wires, which drivers make only while somebody listens: these are to be asked
     for by a pattern that ends in `/wire`.
     """
-    wire = topic.endswith(_WIRE_SUFFIX)
-    if patterns is None:
-        return not wire
-    return any(fnmatchcase(topic, pattern) for pattern in patterns if not wire or pattern.endswith(_WIRE_SUFFIX))
+    if topic.endswith(_WIRE_SUFFIX):
+        patterns = [pattern for pattern in patterns or () if pattern.endswith(_WIRE_SUFFIX)]
+    return matches(topic, patterns)
 
 
 def literal(topic: str) -> str:

@@ -59,7 +59,8 @@ def write_contact_sheet(recording: Recording, file: Path, *, frames: int = 12, c
         shown += len(thumbnails)
         blocks.append(_block(f"{name}: {found.count} frames, {found.rate_hz:.3g} Hz", thumbnails, columns))
     done, data = cv2.imencode(".png", np.vstack(blocks))
-    assert done
+    if not done:
+        raise UnsupportedError(f"{shown} frames could not be made one image", remedy="leave out --contact-sheet")
     try:
         with whole_file(file) as part:
             part.write_bytes(data.tobytes())

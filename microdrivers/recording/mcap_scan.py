@@ -6,6 +6,7 @@ other, and where they contradict, the next chunk that is intact is searched for.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
@@ -22,7 +23,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
-from microdrivers.recording.mcap_writer import CHUNK, MAGIC, MESSAGE, RECORD
+from microdrivers.recording.mcap_records import CHUNK, MAGIC, MESSAGE, RECORD
 
 NOT_ENDED = "the recording was not ended"
 _END_MISSING = f"{NOT_ENDED}: at most its last 0.1 s are missing if its program was killed, more if its disk was full"
@@ -35,6 +36,8 @@ _WINDOW_BYTES = 2048
 _LONGEST_CHUNK = 1 << 32
 _CHUNK_PATTERN = re.compile(rb"\x06(?=.{36}(?:\x00{4}|\x04\x00{3}zstd))", re.DOTALL)
 _LOOKAHEAD = CHUNK.size + 12
+_PAGE_BYTES = 4096
+"""So much of a file an operating system reads or fails to read at once."""
 _OTHERS = frozenset({
     Opcode.HEADER, Opcode.FOOTER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END,
 })  # fmt: skip
@@ -85,6 +88,9 @@ class McapScan:
         complete: whether the file has its end, a summary aside.
         chunks, metadata, attachments: in the order of the file. channels, schemas: those of its summary, by number.
         losses: what is damaged outside of chunks.
+
+    Raises:
+        OSError: there is no such file, or its very beginning cannot be read.
     """
 
     def __init__(self, file: Path) -> None:
@@ -97,10 +103,11 @@ class McapScan:
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.losses: list[Loss] = []
+        self._unreadable: dict[int, str] = {}
         self._stream = file.open("rb", buffering=0)
         self._close = weakref.finalize(self, self._stream.close)
         self.size = os.fstat(self._stream.fileno()).st_size
-        self.has_magic = self._read(0, len(MAGIC)) == MAGIC
+        self.has_magic = os.pread(self._stream.fileno(), len(MAGIC), 0) == MAGIC
         if not self.has_magic and self.size:
             self.losses.append(Loss(0, len(MAGIC), "the file does not begin as an MCAP file does"))
         self._scan()
@@ -110,17 +117,23 @@ class McapScan:
         """No chunk can be read after it."""
         self._close()
 
+    @property
+    def unreadable(self) -> list[Loss]:
+        """What the disk does not give, as far as the file has been read; what that has damaged is told besides."""
+        ranges: list[tuple[int, int, str]] = []
+        for page, why in sorted(self._unreadable.items()):
+            begin = ranges.pop()[0] if ranges and ranges[-1][1:] == (page, why) else page
+            ranges.append((begin, page + _PAGE_BYTES, why))
+        return [Loss(0, 0, f"{end - begin} bytes at byte {begin} cannot be read: {why}") for begin, end, why in ranges]
+
     def read_chunk(self, place: ChunkPlace) -> bytes | Loss:
         """A chunk's records, or what is wrong with it."""
-        try:
-            head = self._read(place.offset, CHUNK.size)
-            if len(head) < CHUNK.size:
-                return Loss(place.offset, len(head), "the file ends in the middle of a chunk")
-            *_, size, crc, name_size = CHUNK.unpack(head)
-            skipped = CHUNK.size + name_size + 8
-            data = self._read(place.offset + skipped, place.length - skipped)
-        except OSError as error:
-            return Loss(place.offset, place.length, f"a chunk cannot be read: {error.strerror}")
+        head = self._read(place.offset, CHUNK.size)
+        if len(head) < CHUNK.size:
+            return Loss(place.offset, len(head), "the file ends in the middle of a chunk")
+        *_, size, crc, name_size = CHUNK.unpack(head)
+        skipped = CHUNK.size + name_size + 8
+        data = self._read(place.offset + skipped, place.length - skipped)
         if name_size:
             try:
                 data = zstandard.decompress(data, size)
@@ -154,7 +167,24 @@ class McapScan:
     # ------------------------------------------------------------------ the way through the file
 
     def _read(self, offset: int, size: int) -> bytes:
-        return os.pread(self._stream.fileno(), size, offset)
+        """Part of the file; what the disk does not give of it is zero, and told by `unreadable`."""
+        with contextlib.suppress(OSError):
+            data = os.pread(self._stream.fileno(), size, offset)
+            if len(data) == size or offset + len(data) >= self.size:
+                return data
+        read = bytearray()
+        end = min(offset + size, self.size)
+        while (place := offset + len(read)) < end:
+            page = place - place % _PAGE_BYTES
+            try:
+                found = os.pread(self._stream.fileno(), end - place, place)
+            except OSError as error:
+                self._unreadable[page] = error.strerror or str(error)
+                found = bytes(min(page + _PAGE_BYTES, end) - place)
+            if not found:
+                break  # it was cut off meanwhile
+            read += found
+        return bytes(read)
 
     def _scan(self) -> None:
         offset = window_start = len(MAGIC)
@@ -215,7 +245,7 @@ class McapScan:
             *_, size, _crc, name_size = CHUNK.unpack_from(head)
             if name_size in (0, 4) and len(head) >= CHUNK.size + name_size + 8:
                 (stored,) = struct.unpack_from("<Q", head, CHUNK.size + name_size)
-                agrees = length == CHUNK.size - 9 + name_size + 8 + stored
+                agrees = length == CHUNK.size - RECORD.size + name_size + 8 + stored
                 agrees = agrees and (stored == size if not name_size else size < _LONGEST_CHUNK)
         return RECORD.size + length if agrees and offset + RECORD.size + length <= self.size else None
 
@@ -227,7 +257,7 @@ class McapScan:
             self.profile = record.profile
         elif isinstance(record, Metadata):
             self.metadata.append(record)
-        elif isinstance(record, Attachment) and struct.unpack("<I", body[-4:])[0] == zlib.crc32(body[9:-4]):
+        elif isinstance(record, Attachment) and struct.unpack("<I", body[-4:])[0] == zlib.crc32(body[RECORD.size : -4]):
             self.attachments.append(record)
         else:
             self.losses.append(Loss(offset, length, f"a record of kind {opcode} is damaged"))

@@ -9,44 +9,20 @@ from __future__ import annotations
 import contextlib
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema, Statistics
 
-MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")
-"""Opcode and length; then the record."""
-MESSAGE = struct.Struct("<BQHIQQ")
-"""Opcode, length, channel, sequence, log time, publish time; then the message's data."""
-MESSAGE_BEGIN = struct.Struct("<BQHI")
-"""Opcode, length, channel, sequence: as much as a reader needs, and no record in a chunk is shorter."""
-CHUNK = struct.Struct("<BQQQQII")
-"""Opcode, length, first and last log time, uncompressed size and CRC, length of the compression's name."""
+from microdrivers.recording.mcap_records import CHUNK, MAGIC, RECORD, end_of_file, message_record, written
 
 _CHUNK_BYTES = 64 * 1024
 _ZSTD = "zstd"
 _ZSTD_LEVEL = 1
 _Part = bytes | bytearray | memoryview
 _U64 = struct.Struct("<Q")
-_MESSAGE_HEAD = MESSAGE.size - 9
 
 
 class Output(Protocol):
@@ -70,57 +46,70 @@ class ChannelKey(NamedTuple):
     schema: bytes
 
 
-class LostChunk(Exception):
-    """A chunk could not be written.
-
-    Attributes:
-        messages: how many messages of which channel are lost.
-        error: why.
-    """
-
-    def __init__(self, messages: Mapping[int, int], error: OSError) -> None:
-        super().__init__(str(error))
-        self.messages = messages
-        self.error = error
+_Message = tuple[int, int, bytes, memoryview | None]
+"""Channel, log time, its record, and what of that is kept elsewhere: pixels."""
 
 
 class _Chunk:
-    """A chunk that is being filled: its records, where the messages of each channel are, and whom it introduces."""
+    """Messages that wait to be written together, and how many bytes they are."""
 
-    __slots__ = ("defines", "index", "parts", "pending", "size")
+    __slots__ = ("messages", "size")
 
     def __init__(self) -> None:
-        self.parts: list[_Part] = []
-        self.pending = bytearray()
+        self.messages: list[_Message] = []
         self.size = 0
-        self.index: dict[int, list[int]] = {}
-        self.defines: list[int] = []
+
+
+class _Held(NamedTuple):
+    """What the file holds, whole records alone, and what is to come.
+
+    One assignment replaces all of it, so that no interruption, wherever it comes, leaves half of a change.
+
+    Attributes:
+        size: of the file, bytes.
+        indexes: how many of the writer's are of records that are in the file.
+        counts: messages by channel; a channel that is not in it has not been defined in the file.
+        first_ns, last_ns: earliest and latest log time.
+        chunk: waits to be written.
+    """
+
+    size: int
+    indexes: int
+    counts: Mapping[int, int]
+    first_ns: int | None
+    last_ns: int
+    chunk: _Chunk
 
 
 class McapWriter:
     """Writes one file. `compress_images` compresses each chunk that holds an image, without loss (zstd).
+
+    An interruption (`KeyboardInterrupt`) may come at any moment: what has not reached the file by then is written with
+    the next chunk.
 
     Raises:
         OSError: the file's first record cannot be written.
     """
 
     def __init__(self, output: Output, *, profile: str, library: str, compress_images: bool = False) -> None:
-        self.size = 0
         self._output = output
         self._torn = False
         self._compress_images = compress_images
         self._channels: dict[ChannelKey, Channel] = {}
         self._schemas: dict[tuple[str, bytes], Schema] = {}
         self._definitions: dict[int, bytes] = {}
-        self._defined: set[int] = set()
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
-        self._chunk_indexes: list[bytes] = []
-        self._counts: Counter[int] = Counter()
-        self._first_ns: int | None = None
-        self._last_ns = 0
-        self._chunk = _Chunk()
-        self._write([MAGIC, _written(Header(profile, library))])
+        self._indexes: list[bytes] = []
+        self._held = _Held(0, 0, {}, None, 0, _Chunk())
+        self._write([MAGIC, written(Header(profile, library))])
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._held.size
+
+    def count(self, channel: int) -> int:
+        """How many messages of the channel are in the file."""
+        return self._held.counts.get(channel, 0)
 
     # ------------------------------------------------------------------ messages
 
@@ -136,76 +125,67 @@ class McapWriter:
                 id=len(self._channels) + 1, topic=key.topic, message_encoding="protobuf", metadata={},
                 schema_id=schema.id,
             )  # fmt: skip
+            self._definitions[known.id] = written(schema) + written(known)
             self._channels[key] = known
-            self._definitions[known.id] = _written(schema) + _written(known)
         return known.id
 
     def add_message(self, channel: int, data: bytes, *, sequence: int, log_ns: int, publish_ns: int) -> None:
         """Add a message to the present chunk.
 
         Raises:
-            LostChunk: the chunk is full now and could not be written.
+            OSError: the chunk is full now and could not be written, as with `flush`.
         """
-        self._append(self._chunk, channel, data, sequence, log_ns, publish_ns)
-        if self._chunk.size > _CHUNK_BYTES:
+        record = message_record(channel, data, 0, sequence, log_ns, publish_ns)
+        chunk = self._held.chunk
+        chunk.messages.append((channel, log_ns, record, None))
+        chunk.size += len(record)
+        if chunk.size > _CHUNK_BYTES:
             self.flush()
 
     def add_image(
-        self, channel: int, head: bytes, pixels: memoryview, *, sequence: int, log_ns: int, publish_ns: int
+        self,
+        channel: int,
+        head: bytes,
+        pixels: memoryview,
+        *,
+        sequence: int,
+        log_ns: int,
+        publish_ns: int,
+        info: tuple[int, bytes] | None = None,
     ) -> None:
         """Add an image, of whose message `pixels` is the last part, and write it at once.
 
-        With `flush` and its info before it, both have a chunk of their own: a reader can leave images out.
+        `info` is channel and data of a message that goes right before it, with the same stamps. After a `flush`, both
+        have a chunk of their own: a reader can leave images out.
 
         Raises:
-            LostChunk: the chunk could not be written; the file is as it was before.
+            OSError: the chunk could not be written, as with `flush`.
         """
-        self._append(self._chunk, channel, head, sequence, log_ns, publish_ns, pixels)
+        messages: list[_Message] = []
+        if info is not None:
+            messages.append((info[0], log_ns, message_record(*info, 0, sequence, log_ns, publish_ns), None))
+        record = message_record(channel, head, pixels.nbytes, sequence, log_ns, publish_ns)
+        messages.append((channel, log_ns, record, pixels))
+        self._held.chunk.messages += messages
         self.flush(compression=_ZSTD if self._compress_images else "")
 
     def flush(self, *, compression: str = "") -> None:
         """Write the present chunk, if there is anything in it.
 
         Raises:
-            LostChunk: it could not be written; the file is as it was before.
+            OSError: it could not be written, and its messages are lost; the file is as it was before.
         """
-        if self._chunk.index:
-            chunk, self._chunk = self._chunk, _Chunk()
-            self._finish_chunk(chunk, compression)
-
-    def _append(
-        self,
-        chunk: _Chunk,
-        channel: int,
-        data: bytes,
-        sequence: int,
-        log_ns: int,
-        publish_ns: int,
-        pixels: memoryview | None = None,
-    ) -> None:
-        pending = chunk.pending
-        if channel not in self._defined:
-            pending += self._definitions[channel]
-            chunk.size += len(self._definitions[channel])
-            chunk.defines.append(channel)
-            self._defined.add(channel)
-        chunk.index.setdefault(channel, []).extend((log_ns, chunk.size))
-        size = _MESSAGE_HEAD + len(data) + (pixels.nbytes if pixels is not None else 0)
-        pending += MESSAGE.pack(Opcode.MESSAGE, size, channel, sequence & 0xFFFFFFFF, log_ns, publish_ns)
-        pending += data
-        chunk.size += 9 + size
-        if pixels is not None:
-            chunk.parts += (pending, pixels)
-            chunk.pending = bytearray()
-
-    def _finish_chunk(self, chunk: _Chunk, compression: str) -> None:
+        if not self._held.chunk.messages:
+            return
         try:
-            self._write_chunk([*chunk.parts, chunk.pending], chunk.size, chunk.index, compression)
-        except OSError as error:
-            self._defined.difference_update(chunk.defines)
-            raise LostChunk({channel: len(entries) // 2 for channel, entries in chunk.index.items()}, error) from error
+            self._write_chunk(self._held.chunk.messages, compression)
+        except Exception:
+            self._held = self._held._replace(chunk=_Chunk())
+            raise
 
-    def _write_chunk(self, parts: list[_Part], size: int, index: dict[int, list[int]], compression: str) -> None:
+    def _write_chunk(self, messages: list[_Message], compression: str) -> None:
+        held = self._held
+        parts, size, index = self._laid_out(messages)
         crc = 0
         for part in parts:
             crc = zlib.crc32(part, crc)
@@ -216,24 +196,46 @@ class McapWriter:
         first_ns = min(min(entries[::2]) for entries in index.values())
         last_ns = max(max(entries[::2]) for entries in index.values())
         name = compression.encode()
-        length = CHUNK.size - 9 + len(name) + 8 + stored
+        length = CHUNK.size - RECORD.size + len(name) + 8 + stored
         head = CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, crc, len(name)) + name + _U64.pack(stored)
-        start, offset, offsets, indexes = self.size, self.size + 9 + length, bytearray(), bytearray()
+        offset, offsets, indexes = held.size + RECORD.size + length, bytearray(), bytearray()
         for channel, entries in index.items():
             offsets += struct.pack("<HQ", channel, offset + len(indexes))
             entries_size = 8 * len(entries)
             indexes += struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries_size, channel, entries_size)
             indexes += struct.pack(f"<{len(entries)}Q", *entries)
-        self._write([head, *parts, indexes])
         body = b"".join((
-            struct.pack("<QQQQI", first_ns, last_ns, start, 9 + length, len(offsets)), offsets,
+            struct.pack("<QQQQI", first_ns, last_ns, held.size, RECORD.size + length, len(offsets)), offsets,
             struct.pack("<QI", len(indexes), len(name)), name, struct.pack("<QQ", stored, size),
         ))  # fmt: skip
-        self._chunk_indexes.append(struct.pack("<BQ", Opcode.CHUNK_INDEX, len(body)) + body)
-        self._first_ns = first_ns if self._first_ns is None else min(self._first_ns, first_ns)
-        self._last_ns = max(self._last_ns, last_ns)
-        for channel, entries in index.items():
-            self._counts[channel] += len(entries) // 2
+        self._write(
+            [head, *parts, indexes], RECORD.pack(Opcode.CHUNK_INDEX, len(body)) + body,
+            counts={**held.counts, **{number: self.count(number) + len(index[number]) // 2 for number in index}},
+            first_ns=first_ns if held.first_ns is None else min(held.first_ns, first_ns),
+            last_ns=max(held.last_ns, last_ns), chunk=_Chunk(),
+        )  # fmt: skip
+
+    def _laid_out(self, messages: list[_Message]) -> tuple[list[_Part], int, dict[int, list[int]]]:
+        """A chunk's content, its size, and by channel the log time and place of each message."""
+        parts: list[_Part] = []
+        content = bytearray()
+        place = 0
+        index: dict[int, list[int]] = {}
+        for channel, log_ns, record, pixels in messages:
+            entries = index.get(channel)
+            if entries is None:
+                entries = index[channel] = []
+                if channel not in self._held.counts:
+                    content += self._definitions[channel]
+                    place += len(self._definitions[channel])
+            entries += (log_ns, place)
+            content += record
+            place += len(record)
+            if pixels is not None:
+                parts += (content, pixels)
+                content = bytearray()
+                place += pixels.nbytes
+        return [*parts, content], place, index
 
     # ------------------------------------------------------------------ other records
 
@@ -243,10 +245,9 @@ class McapWriter:
         Raises:
             OSError: it could not be written.
         """
-        record = _written(Metadata(name=name, metadata=dict(data)))
+        record = written(Metadata(name=name, metadata=dict(data)))
         index = MetadataIndex(offset=self.size, length=len(record), name=name)
-        self._write([record])
-        self._metadata.append(index)
+        self._write([record], written(index))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, *, log_ns: int) -> None:
         """Write an attachment at once.
@@ -255,13 +256,12 @@ class McapWriter:
             OSError: it could not be written.
         """
         attachment = Attachment(create_time=0, log_time=log_ns, name=name, media_type=media_type, data=data)
-        record = _written(attachment)
+        record = written(attachment)
         index = AttachmentIndex(
             offset=self.size, length=len(record), log_time=log_ns, create_time=0, data_size=len(data), name=name,
             media_type=media_type,
         )  # fmt: skip
-        self._write([record])
-        self._attachments.append(index)
+        self._write([record], written(index))
 
     def finish(self) -> None:
         """Write the summary and the end, all chunks having been flushed.
@@ -269,68 +269,51 @@ class McapWriter:
         Raises:
             OSError: it could not be written; the file is then readable as a torn one.
         """
-        defined = [channel for channel in self._channels.values() if channel.id in self._defined]
+        held = self._held
+        indexes: dict[int, list[bytes]] = {
+            Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
+        }  # fmt: skip
+        for index in self._indexes[: held.indexes]:
+            indexes[index[0]].append(index)
+        defined = [channel for channel in self._channels.values() if channel.id in held.counts]
         schemas = {channel.schema_id for channel in defined}
         statistics = Statistics(
-            attachment_count=len(self._attachments), channel_count=len(defined),
-            channel_message_counts=dict(sorted(self._counts.items())), chunk_count=len(self._chunk_indexes),
-            message_count=self._counts.total(), metadata_count=len(self._metadata),
-            message_start_time=self._first_ns or 0, message_end_time=self._last_ns, schema_count=len(schemas),
+            attachment_count=len(indexes[Opcode.ATTACHMENT_INDEX]), channel_count=len(defined),
+            channel_message_counts=dict(sorted(held.counts.items())), chunk_count=len(indexes[Opcode.CHUNK_INDEX]),
+            message_count=sum(held.counts.values()), metadata_count=len(indexes[Opcode.METADATA_INDEX]),
+            message_start_time=held.first_ns or 0, message_end_time=held.last_ns, schema_count=len(schemas),
         )  # fmt: skip
         groups = {
-            Opcode.SCHEMA: [_written(schema) for schema in self._schemas.values() if schema.id in schemas],
-            Opcode.CHANNEL: [_written(channel) for channel in defined],
-            Opcode.STATISTICS: [_written(statistics)],
-            Opcode.CHUNK_INDEX: self._chunk_indexes,
-            Opcode.ATTACHMENT_INDEX: [_written(index) for index in self._attachments],
-            Opcode.METADATA_INDEX: [_written(index) for index in self._metadata],
+            Opcode.SCHEMA: [written(schema) for schema in self._schemas.values() if schema.id in schemas],
+            Opcode.CHANNEL: [written(channel) for channel in defined],
+            Opcode.STATISTICS: [written(statistics)],
+            **indexes,
         }
-        end = _written(DataEnd(0))
-        summary_start = self.size + len(end)
-        summary, offsets = bytearray(), bytearray()
-        for opcode, records in groups.items():
-            start = len(summary)
-            summary += b"".join(records)
-            if len(summary) > start:
-                offsets += _written(
-                    SummaryOffset(
-                        group_opcode=opcode, group_start=summary_start + start, group_length=len(summary) - start
-                    )
-                )
-        offsets_start = summary_start + len(summary)
-        summary += offsets
-        footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, offsets_start)
-        crc = zlib.crc32(footer, zlib.crc32(summary))
-        footer = _written(Footer(summary_start=summary_start, summary_offset_start=offsets_start, summary_crc=crc))
-        self._write([end, summary, footer, MAGIC])
+        self._write([end_of_file(groups, offset=held.size)])
 
-    def _write(self, parts: list[_Part]) -> None:
-        """Write all of it or nothing."""
+    def _write(self, parts: list[_Part], *indexes: bytes, **changes: Any) -> None:
+        """Write all of it or nothing; with its last byte, `changes` of what is held count."""
         if self._torn:
             self._take_back()
-        written = 0
+        del self._indexes[self._held.indexes :]
+        self._indexes += indexes
+        self._torn = True
+        size = self._held.size
         try:
             for part in parts:
                 rest = memoryview(part)
                 while rest.nbytes:
                     count = self._output.write(rest) or 0
                     rest = rest[count:]
-                    written += count
-        except OSError:
-            self._torn = True
+                    size += count
+            self._held = self._held._replace(size=size, indexes=len(self._indexes), **changes)
+            self._torn = False
+        except BaseException:  # also an interruption
             with contextlib.suppress(OSError):  # it is tried again before the next write
                 self._take_back()
             raise
-        self.size += written
 
     def _take_back(self) -> None:
         self._output.truncate(self.size)
         self._output.seek(self.size)
         self._torn = False
-
-
-def _written(record: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    written: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return written

@@ -49,14 +49,14 @@ def create_file(file: Path) -> OutputFile:
 
 
 def refuse_existing(file: Path, what: str = "a recording") -> None:
-    """See that nothing would be written over.
+    """See that nothing would be overwritten.
 
     Raises:
         ConfigError: the file exists.
     """
     if os.path.lexists(file):
         raise ConfigError(
-            f"the file exists, and {what} is never written over", file=str(file),
+            f"the file already exists, and {what} is never overwritten", file=str(file),
             remedy="choose another name, or remove the file",
         )  # fmt: skip
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -15,7 +14,7 @@ from mcap.records import Channel, Schema
 
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import Frame, Sample
-from microdrivers.recording.channels import ARRIVALS_TOPIC
+from microdrivers.recording.channels import ARRIVALS_TOPIC, matches
 from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording
 from microdrivers.recording.header import (
     CLOCK_RECORD,
@@ -28,8 +27,8 @@ from microdrivers.recording.header import (
     RecordingHeader,
     from_metadata,
 )
+from microdrivers.recording.mcap_records import MESSAGE, MESSAGE_BEGIN, RECORD
 from microdrivers.recording.mcap_scan import NOT_ENDED, ChunkPlace, Loss, McapScan, read_definition
-from microdrivers.recording.mcap_writer import MESSAGE, MESSAGE_BEGIN, RECORD
 from microdrivers.recording.recorded_channels import Action, ChannelReader, FrameJoin, Unreadable, channel_reader
 from microdrivers.recording.survey import Survey, TopicSummary
 
@@ -73,6 +72,7 @@ class Recording:
         self.clock = read_clock_record(self._scan)
         self._damaged: dict[int, Loss] = {}
         self._unreadable: dict[tuple[int, int], str] = {}
+        self._survey: Survey | None = None
         self._frames: dict[int, tuple[str, int, int]] = {}
         """Topic, `t_ns` and `seq` of frames that were read, by the place of a chunk that holds nothing else."""
 
@@ -87,12 +87,14 @@ class Recording:
         """
         return chain.from_iterable(self._walk(topics, lambda reader: reader.take, leave_out=leave_out))
 
-    @cached_property
-    def _survey(self) -> Survey:
-        survey = Survey()
-        for _ in self._walk(None, survey.counter, known_frame=survey.count_frame):
-            pass
-        return survey
+    def _read_all(self) -> Survey:
+        """What the file holds; once it has been read, what is damaged of it is known."""
+        if self._survey is None:
+            survey = Survey()
+            for _ in self._walk(None, survey.counter, known_frame=survey.count_frame):
+                pass
+            self._survey = survey
+        return self._survey
 
     @cached_property
     def _arrivals(self) -> Mapping[str, Sequence[int]]:
@@ -104,7 +106,7 @@ class Recording:
     @property
     def topics(self) -> Mapping[str, TopicSummary]:
         """What there is of each topic; the first look at it reads all of the file."""
-        return self._survey.topics()
+        return self._read_all().topics()
 
     @property
     def arrivals(self) -> Mapping[str, Sequence[int]]:
@@ -130,10 +132,10 @@ class Recording:
 
     @property
     def _damage(self) -> list[Loss]:
-        assert self._survey is not None
+        self._read_all()
         what = Counter(self._unreadable.values())
         unreadable = [Loss(0, 0, f"{count} × {text}") for text, count in what.items()]
-        return [*sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
+        return [*self._scan.unreadable, *sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
 
     def check_indexes(self) -> list[Loss]:
         """What is damaged of the times and places that other programs find samples by; reads all of the file.
@@ -202,7 +204,7 @@ class Recording:
                 return  # the summary's, again with its first message
             defined[channel.id] = definition
             reader = channel_reader(channel, schemas.get(channel.schema_id), joins)
-            wanted = _is_wanted(reader.topic, topics) and not (leave_out and _is_wanted(reader.topic, leave_out))
+            wanted = matches(reader.topic, topics) and not matches(reader.topic, leave_out)
             actions[channel.id] = _Wanted(reader.topic, reader.is_image, action(reader)) if wanted else None
 
         def define_with(record: Schema | Channel | None) -> None:
@@ -287,10 +289,6 @@ def _told_losses(scan: McapScan) -> Iterator[Loss]:
         elif record.name == FAILURE_RECORD:
             reason = record.metadata.get("reason", "unknown")
             yield Loss(0, 0, f"the recording was stopped because it could not be written: {reason}")
-
-
-def _is_wanted(topic: str, topics: Collection[str] | None) -> bool:
-    return topics is None or any(fnmatchcase(topic, pattern) for pattern in topics)
 
 
 def _holds_an_unwanted_image(place: ChunkPlace, actions: Mapping[int, object | None]) -> bool:

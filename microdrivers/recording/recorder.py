@@ -6,10 +6,10 @@ import contextlib
 import logging
 import os
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from microdrivers.core.bus import Bus, Subscription, Topic
 from microdrivers.core.clock import Clock, Timer
@@ -33,12 +33,6 @@ QUEUE_IMAGE_BYTES = 256 * 1024 * 1024
 
 class RecordingFailed(MicrodriversError):
     """A recording could not be written to its end, and was asked not to go on without it."""
-
-
-class _Waiting(NamedTuple):
-    topic: str
-    sample: Sample
-    now_ns: int
 
 
 class Recorder:
@@ -83,23 +77,21 @@ class Recorder:
         self._clock = clock
         self._patterns = topics
         self._on_failure = on_failure
-        self._counts: dict[str, TopicCount] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._queue: list[_Waiting] = []
+        self._queue: list[tuple[str, Sample, int]] = []
         self._queued_image_bytes = 0
         self._queue_lock = threading.Lock()
         self._write_lock = threading.Lock()
-        self._arrivals: dict[str, list[int]] = {}
         self._followed: dict[str, Sequence[int]] = {}
-        self._followed_so_far: dict[str, int] = {}
         self._told: set[str] = set()
         self._failure: OSError | None = None
         self._closed = False
+        self._complete = False
         start = read_clock(clock)
         output = create_file(file)
         try:
             self._out = SampleFile(
-                output, header=header, clock=start, counts=self._counts, on_loss=self._lost,
+                output, header=header, clock=start, on_misfit=self._tell, on_failure=self._fail,
                 compress_images=compress_images,
             )  # fmt: skip
         except OSError as error:
@@ -117,17 +109,22 @@ class Recorder:
     @property
     def counts(self) -> Mapping[str, TopicCount]:
         """By topic, what was written and what was dropped so far."""
-        return dict(self._counts)
+        return dict(self._out.counts)
 
     @property
     def dropped(self) -> int:
         """How many samples of all topics were not written so far."""
-        return sum(count.dropped for count in tuple(self._counts.values()))
+        return sum(count.dropped for count in tuple(self._out.counts.values()))
 
     @property
     def size(self) -> int:
         """Bytes in the file so far."""
         return self._out.size
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file has its end."""
+        return self._complete
 
     @property
     def failure(self) -> OSError | None:
@@ -144,11 +141,11 @@ class Recorder:
 
     @property
     def disturbance(self) -> str:
-        """What somebody else has done to the file since it was made; empty if neither its name nor its size tells."""
+        """What has become of the file by somebody else's hand; empty if neither its name nor its size tells."""
         now = _status(self.file)
         if now is None or self._made is None or not os.path.samestat(now, self._made):
-            return "somebody has removed, renamed or replaced it, or its disk"
-        return "" if now.st_size == self.size else "somebody else has written to it, too"
+            return "gone: it, or its disk, was removed, renamed or replaced during the recording"
+        return "" if now.st_size == self.size else "corrupt: another program wrote to it during the recording"
 
     def wants(self, topic: str) -> bool:
         """Whether that topic is recorded, if there is one."""
@@ -164,40 +161,31 @@ class Recorder:
             except OSError as error:
                 self._fail(error, f"{name} could not be attached")
 
-    def note_arrivals(self, host: str, orders: Iterable[int]) -> None:
-        """Note that an estimator's inbox has received the samples with these order numbers, in this order."""
-        with self._queue_lock:
-            self._arrivals.setdefault(host, []).extend(orders)
-
     def follow_arrivals(self, host: str, arrivals: Sequence[int]) -> None:
         """Note what is and will be appended to `arrivals`, which may be an `Inbox.arrivals`."""
-        with self._queue_lock:
-            self._followed[host] = arrivals
+        self._followed[host] = arrivals
 
     def close(self) -> None:
         """Write what is waiting, and the file's end; idempotent.
+
+        If it is interrupted, what still waits is counted as dropped, and the end is written; a second time, it ends
+        there: see `complete`.
 
         Raises:
             RecordingFailed: something could not be written and `on_failure` is `stop`.
         """
         if self._closed:
             return
-        self._unwatch()
-        for subscription in self._subscriptions.values():
-            subscription.cancel()
-        if self._timer is not None:
-            self._timer.cancel()
-        self._write_waiting()
-        with self._write_lock:
-            self._closed = True
-            stopped = self._failure if self.stopped else None
-            failure = None if stopped is None else stopped.strerror or str(stopped)
-            try:
-                self._out.finish(read_clock(self._clock), now_ns=self._clock.now_ns(), failure=failure)
-            except OSError as error:
-                self._fail(error, "its end could not be written; what it holds can be read all the same")
-            self._output.close()
-        dropped = {topic: count.dropped for topic, count in self._counts.items() if count.dropped}
+        try:
+            self._unwatch()
+            for subscription in self._subscriptions.values():
+                subscription.cancel()
+            if self._timer is not None:
+                self._timer.cancel()
+            self._write_waiting()
+        finally:
+            self._end()
+        dropped = {topic: count.dropped for topic, count in self.counts.items() if count.dropped}
         if dropped:
             listed = ", ".join(f"{topic} {number}" for topic, number in dropped.items())
             _log.error("%s: %d samples were not recorded: %s", self.file, self.dropped, listed)
@@ -206,6 +194,23 @@ class Recorder:
                 f"{self.file} could not be written: {self._failure.strerror or self._failure}",
                 remedy="free space on the disk, or choose another file; to go on with gaps, say so: --on-failure go-on",
             )
+
+    def _end(self) -> None:
+        with self._write_lock:
+            try:
+                self._closed = True
+                for topic, *_ in self._queue:  # an interruption has left them
+                    self._out.counts[topic].refused += 1
+                stopped = self._failure if self.stopped else None
+                failure = None if stopped is None else stopped.strerror or str(stopped)
+                self._out.write_arrivals(self._followed, now_ns=self._clock.now_ns())
+                try:
+                    self._out.finish(read_clock(self._clock), now_ns=self._clock.now_ns(), failure=failure)
+                    self._complete = True
+                except OSError as error:
+                    self._fail(error, "its end could not be written; what it holds can be read all the same")
+            finally:
+                self._output.close()
 
     def __enter__(self) -> Recorder:
         return self
@@ -222,14 +227,22 @@ class Recorder:
     # ------------------------------------------------------------------ in the publisher's thread
 
     def _found_topic(self, topic: Topic[Any]) -> None:
-        if topic.name in self._subscriptions or not is_wanted(topic.name, self._patterns):
+        if not is_wanted(topic.name, self._patterns):
+            return
+        try:
+            self._subscribe(topic)
+        except BaseException:  # an interruption: the bus tells of each topic once
+            self._subscribe(topic)
+            raise
+
+    def _subscribe(self, topic: Topic[Any]) -> None:
+        if topic.name in self._subscriptions:
             return
         try:
             self._out.add_topic(topic.name, topic.sample_type)
         except UnsupportedType as error:
             _log.error("%s: topic %r is not recorded: %s", self.file, topic.name, error)
             return
-        self._counts.setdefault(topic.name, TopicCount())
         latest = topic.latest if topic.name.startswith(TRUTH_PREFIX) else None
         take = self._take_inline if self._clock.simulated else self._take
         # The name goes with the call: a sample does not know its topic.
@@ -240,7 +253,7 @@ class Recorder:
     def _take_inline(self, topic: str, sample: Sample) -> None:
         now_ns = self._clock.now_ns()
         with self._write_lock:
-            self._out.write(topic, sample, now_ns=now_ns)
+            self._out.write(((topic, sample, now_ns),))
         if now_ns - self._last_flush_ns >= FLUSH_NS:
             self._write_waiting()
 
@@ -249,10 +262,11 @@ class Recorder:
         with self._queue_lock:
             full = len(self._queue) >= QUEUE_SAMPLES
             if not full and (not image_bytes or self._queued_image_bytes + image_bytes <= QUEUE_IMAGE_BYTES):
-                self._queue.append(_Waiting(topic, sample, self._clock.now_ns()))
+                self._queue.append((topic, sample, self._clock.now_ns()))
                 self._queued_image_bytes += image_bytes
                 return
-        self._lost(topic, 1, "the disk does not keep up")
+            self._out.counts[topic].refused += 1
+        self._tell(topic, "the disk does not keep up")
 
     # ------------------------------------------------------------------ where the file is written
 
@@ -260,30 +274,22 @@ class Recorder:
         with self._write_lock:
             if self._closed:
                 return
-            with self._queue_lock:
-                waiting, self._queue, self._queued_image_bytes = self._queue, [], 0
-                arrivals, self._arrivals = self._arrivals, {}
-                for host, orders in self._followed.items():
-                    before = self._followed_so_far.get(host, 0)
-                    new = orders[before : len(orders)]
-                    self._followed_so_far[host] = before + len(new)
-                    arrivals.setdefault(host, []).extend(new)
-            for topic, sample, now_ns in waiting:
-                self._out.write(topic, sample, now_ns=now_ns)
+            rest: Iterator[tuple[str, Sample, int]] = iter(())
+            try:
+                with self._queue_lock:
+                    rest, self._queue, self._queued_image_bytes = iter(self._queue), [], 0
+                self._out.write(rest)
+            finally:  # an interruption leaves some
+                with self._queue_lock:
+                    self._queue[:0] = rest
             now_ns = self._clock.now_ns()
-            for host, orders in arrivals.items():
-                if orders:
-                    self._out.write_arrivals(host, orders, now_ns=now_ns)
+            self._out.write_arrivals(dict(self._followed), now_ns=now_ns)
             self._out.flush(now_ns=now_ns)
             self._last_flush_ns = now_ns
 
-    def _lost(self, topic: str, number: int, why: str, error: OSError | None = None) -> None:
-        """Count samples that will not be in the file; each reason is said once."""
-        with self._queue_lock:
-            self._counts.setdefault(topic, TopicCount()).dropped += number
-        if error is not None:
-            self._fail(error, why)
-        elif why not in self._told:
+    def _tell(self, topic: str, why: str) -> None:
+        """Samples will not be in the file; each reason is said once."""
+        if why not in self._told:
             self._told.add(why)
             _log.error("%s: samples of %r are not recorded: %s (further ones are only counted)", self.file, topic, why)
 

@@ -20,8 +20,9 @@ from microdrivers.recording.header import (
     to_metadata,
 )
 from microdrivers.recording.images import IMAGE_SCHEMA
+from microdrivers.recording.mcap_records import MESSAGE, RECORD
 from microdrivers.recording.mcap_scan import Loss, McapScan, read_definition, records_in
-from microdrivers.recording.mcap_writer import MESSAGE, ChannelKey, LostChunk, McapWriter
+from microdrivers.recording.mcap_writer import ChannelKey, McapWriter
 from microdrivers.recording.output import not_writable, refuse_existing, whole_file
 from microdrivers.recording.reader import LIST_MARK, open_scan, read_clock_record, read_header
 from microdrivers.recording.schemas import FrameInfo, schema_name
@@ -35,6 +36,7 @@ class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
         messages: how many messages of which topic were kept.
         losses: what could not be.
         mended: what was damaged and could be made anew.
+        backwards: how many messages of which topic were logged before their predecessor, as their log times say.
         size, lost_bytes: of the original, and how many of these cannot be read.
     """
 
@@ -43,6 +45,7 @@ class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
     messages: Mapping[str, int]
     losses: list[Loss]
     mended: list[Loss]
+    backwards: Mapping[str, int]
     size: int
     lost_bytes: int
 
@@ -68,14 +71,13 @@ def repair(file: Path, out: Path) -> RepairReport:
                 copy = _Copy(scan, writer)
                 copy.run(to_metadata(header))
                 refuse_existing(out)
-        except (OSError, LostChunk) as error:
-            raise not_writable(out, error.error if isinstance(error, LostChunk) else error) from error
+        except OSError as error:
+            raise not_writable(out, error) from error
     finally:
         scan.close()
-    losses = sorted([*scan.losses, *copy.losses])
     return RepairReport(
-        file=file, out=out, messages=dict(copy.messages), losses=losses, mended=copy.mended,
-        size=scan.size, lost_bytes=sum(loss.size for loss in losses),
+        file=file, out=out, messages=dict(copy.messages), losses=copy.losses, mended=copy.mended,
+        backwards=dict(+copy.backwards), size=scan.size, lost_bytes=sum(loss.size for loss in copy.losses),
     )  # fmt: skip
 
 
@@ -84,13 +86,22 @@ class _Copy:
 
     def __init__(self, scan: McapScan, writer: McapWriter) -> None:
         self.messages: Counter[str] = Counter()
-        self.losses: list[Loss] = []
         self.mended: list[Loss] = []
+        self.backwards: Counter[str] = Counter()
         self._scan = scan
         self._writer = writer
         self._schemas: dict[int, Schema] = dict(scan.schemas)
         self._channels: dict[int, Channel] = dict(scan.channels)
+        self._damaged: list[Loss] = []
         self._undefined = 0
+        self._last_ns: dict[int, int] = {}
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What of the original could not be kept."""
+        undefined = Loss(0, 0, f"{self._undefined} messages of channels whose definition is lost")
+        damaged = [*self._scan.losses, *self._damaged, *([undefined] if self._undefined else [])]
+        return [*self._scan.unreadable, *sorted(damaged)]
 
     def run(self, header: Mapping[str, str]) -> None:
         """Copy everything, and end the file."""
@@ -106,16 +117,12 @@ class _Copy:
         for place in self._scan.chunks:
             chunk = self._scan.read_chunk(place)
             if isinstance(chunk, Loss):
-                self.losses.append(chunk)
+                self._damaged.append(chunk)
             else:
                 self.mended += self._scan.contradictions(place, chunk)
                 self._copy_chunk(chunk)
         self._writer.flush()
-        if self._undefined:
-            self.losses.append(Loss(0, 0, f"{self._undefined} messages of channels whose definition is lost"))
-        self._writer.add_metadata(
-            REPAIR_RECORD, {"losses": LIST_MARK.join(map(str, [*self._scan.losses, *self.losses]))}
-        )
+        self._writer.add_metadata(REPAIR_RECORD, {"losses": LIST_MARK.join(map(str, self.losses))})
         self._writer.finish()
 
     def _copy_chunk(self, chunk: bytes) -> None:
@@ -130,15 +137,17 @@ class _Copy:
                 self._channels[record.id] = record
 
     def _copy_message(self, chunk: bytes, start: int, end: int) -> None:
-        _, _, number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(chunk, start - 9)
+        _, _, number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(chunk, start - RECORD.size)
         channel = self._channels.get(number)
         schema = self._schemas.get(channel.schema_id) if channel is not None else None
         if channel is None or schema is None:
             self._undefined += 1
             return
-        body = start + MESSAGE.size - 9
+        body = start + MESSAGE.size - RECORD.size
         new = self._writer.channel(ChannelKey(channel.topic, schema.name, schema.data))
         self.messages[channel.topic] += 1
+        self.backwards[channel.topic] += log_ns < self._last_ns.get(new, 0)
+        self._last_ns[new] = log_ns
         if schema.name == schema_name(FrameInfo):
             self._writer.flush()
         if schema.name == IMAGE_SCHEMA:

@@ -97,8 +97,8 @@ def batches_of(
     """
     kind = summary_of(recording, topic).sample_type
     batch: list[Sample] = []
-    for _, sample in sampleswithout_images(recording, topic):
-        batch.append(sample)
+    for _, sample in recording.samples((literal(topic),)):
+        batch.append(without_image(sample))
         if len(batch) == size:
             yield arrays_of(batch, kind, start_ns=start_ns)
             batch = []
@@ -106,21 +106,14 @@ def batches_of(
         yield arrays_of(batch, kind, start_ns=start_ns)
 
 
-def sampleswithout_images(recording: Recording, topic: str) -> Iterator[tuple[str, Sample]]:
-    """A topic's samples; of frames, only the batch in work is kept, images excepted."""
-    for name, sample in recording.samples((literal(topic),)):
-        if isinstance(sample, Frame):
-            yield name, without_image(sample)
-        else:
-            yield name, sample
-
-
 _NO_IMAGE: npt.NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
 
 
-def without_image(frame: Frame) -> Frame:
-    """The frame with an empty image: what is kept of it until a batch is full."""
-    fields = {name: getattr(frame, name) for name in frame.__struct_fields__}
+def without_image(sample: Sample) -> Sample:
+    """The sample; of a frame, one with an empty image: what is kept of it until a batch is full."""
+    if not isinstance(sample, Frame):
+        return sample
+    fields = {name: getattr(sample, name) for name in sample.__struct_fields__}
     return Frame(**fields | {"image": _NO_IMAGE})
 
 

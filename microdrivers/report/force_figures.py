@@ -10,9 +10,10 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from microdrivers.core.protocol_names import ProtocolName
 from microdrivers.report.number_format import significant
 from microdrivers.report.svg import BLUE, INK, MOVING, ORANGE, SHADE, WIDTH_IN, inline_svg, page_style
-from microdrivers.results.force import ForceResult, ProtocolName
+from microdrivers.results.force import ForceResult
 
 Array = npt.NDArray[np.float64]
 

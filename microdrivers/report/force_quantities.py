@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from microdrivers.core.protocol_names import PROTOCOLS, ProtocolName
 from microdrivers.report.number_format import compact, significant, with_uncertainty, without_exponents
-from microdrivers.results.force import PROTOCOLS, ForceResult, ProtocolName, VisionCheck
+from microdrivers.results.force import ForceResult, VisionCheck
 
 FACTOR_95 = 1.96
 K2_UNIT = "10⁻⁶ µN/µm³"

@@ -14,6 +14,7 @@ import pydantic
 import yaml
 
 from microdrivers.core.errors import ConfigError
+from microdrivers.core.protocol_names import ProtocolName
 from microdrivers.results.record import Provenance, Record, Trace
 
 SCHEMA_VERSION = 1
@@ -22,10 +23,6 @@ _COORDINATES = """\
 # The model's x is the deformation less contact_um and, if there is one, less the slip of eq. (26). valid_for is what x
 # and its rate may be; pressed_um is how far the contact point went in, slip included.
 """
-
-ProtocolName = Literal["single", "unloading_springs", "loading_only", "slip_corrected", "loading"]
-PROTOCOLS: tuple[ProtocolName, ...] = ("single", "unloading_springs", "loading_only", "slip_corrected", "loading")
-"""The paper's four ways to fit its model, section III.C, and the loading part alone."""
 
 
 class Contact(Record):
@@ -203,7 +200,7 @@ class ForceResult(Record):
         best: the protocol that suits the record best.
         excluded_samples: reason → number of samples that no fit used.
         vision_force_error_percent: 100·RMS(F − F̂)/RMS(F) of the fresh indentation; None if there was none.
-        largest_speed_um_s: keeps the predicted force below `setup.largest_force_uN` at the deepest point; null
+        largest_speed_um_s: keeps the predicted force below `setup.largest_force_uN` down to the deepest point; null
             where the record does not determine k1 and b.
     """
 

@@ -13,7 +13,7 @@ from microdrivers.core.clock import Clock
 from microdrivers.core.contact_samples import Intervention
 from microdrivers.core.errors import UnsafeError
 from microdrivers.core.samples import ForceSample, Sample
-from microdrivers.core.units import seconds_to_ns
+from microdrivers.core.units import NS_PER_S, seconds_to_ns
 from microdrivers.devices.base import Device
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.motion_plan import MotionPlan
@@ -63,10 +63,12 @@ class Safety:
 
     # ------------------------------------------------------------------ for routines
 
-    def limit_uN(self, sensor: str) -> float | None:
-        """The largest force that a sensor's guard allows; None if it has no guard."""
+    def limit_uN(self, sensor: str, *, tare_uN: float = 0.0) -> float | None:
+        """The largest push, tared, that a sensor's guard allows; None if it has no guard."""
         guard = self.guards.get(sensor)
-        return None if guard is None else guard.settings.max_force_uN
+        if guard is None:
+            return None
+        return guard.settings.max_force_uN - (tare_uN - guard.settings.zero_of_uN(tare_uN))
 
     def max_speed_um_s(self, sensor: str) -> float:
         """The largest speed that a sensor's guard allows its stage; infinite if it states none."""
@@ -141,7 +143,7 @@ class Safety:
         """Wait until tools that are being taken away have got there."""
         deadline_ns = self._clock.now_ns() + seconds_to_ns(_LONGEST_RETRACTION_S)
         for guard in self.guards.values():
-            guard.retraction.finish(max(0.0, (deadline_ns - self._clock.now_ns()) / 1e9))
+            guard.retraction.finish(max(0.0, (deadline_ns - self._clock.now_ns()) / NS_PER_S))
 
     def disarm(self) -> None:
         """Nothing begins to move by itself from now on."""

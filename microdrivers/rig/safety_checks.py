@@ -68,7 +68,7 @@ def _check_guard(
         if name not in suitable:
             wrong = True
             if name in devices or name not in rig.devices:  # what is there and was not understood has errors of its own
-                what = f"{name!r} is no {kind.__name__}" if name in devices else f"there is no device {name!r} here"
+                what = f"{name!r} is not a {kind.__name__}" if name in devices else f"there is no device {name!r} here"
                 remedy = f"name one of {', '.join(suitable)}" if suitable else "leave the guard out"
                 yield document.error(what, (*where, key), remedy=remedy)
     if wrong:
@@ -87,7 +87,8 @@ def _check_guard(
     largest_um_s = stage.largest_speed_um_s if isinstance(stage, ToolCarrierSettings) else math.inf
     if guard.max_speed_um_s is not None and guard.max_speed_um_s > largest_um_s:
         yield document.error(
-            f"{guard.max_speed_um_s:g} µm/s forbid nothing: {guard.stage} moves at {largest_um_s:g} µm/s at most",
+            f"a limit of {guard.max_speed_um_s:g} µm/s has no effect: {guard.stage} moves at {largest_um_s:g} µm/s at "
+            "most",
             (*where, "max_speed_um_s"),
             remedy="state less, so that the tool stops soon enough, or leave it out",
         )
@@ -128,7 +129,7 @@ def _check_figures(
 def _check_repetition(names: list[str], part: str, key: str, document: Document) -> Iterator[ConfigError]:
     for i, name in enumerate(names):
         if name in names[:i]:
-            yield document.error(f"{name!r} stands here twice", (_SECTION, part, i, key), remedy="keep one of them")
+            yield document.error(f"{name!r} is listed twice", (_SECTION, part, i, key), remedy="keep one of them")
 
 
 def _check_origins(devices: Mapping[str, DeviceEntry], document: Document) -> Iterator[ConfigError]:

@@ -7,11 +7,13 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
-from microdrivers.core.clock import Clock, ClockError
+from microdrivers.core.clock import Clock
 from microdrivers.core.errors import MicrodriversError, UnsafeError
+from microdrivers.core.samples import ForceSample
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
 from microdrivers.devices.base import Device
 from microdrivers.devices.force_sensor import ForceSensor
+from microdrivers.rig.safety_force_data import ForceData
 
 _FIRST_READING_S = 0.5
 _REMEMBERED_NS = 2 * NS_PER_S
@@ -40,37 +42,22 @@ class ForceFlow:
         self._on_beat = on_beat
         self._kept: ExitStack | None = None
         self._beginning = threading.RLock()
-        self._heard_ns = -NS_PER_S
-        self._why_not = ""
-        self._awaited = False
-        self._arrived = clock.event()
+        self._data = ForceData(sensor, clock=clock, stale_after_ns=stale_after_ns)
         self._looked_ns = -1
         self._late_ns = 0
         self._late_until_ns = -1
 
     # ------------------------------------------------------------------ what comes
 
-    def heard(self, t_ns: int) -> None:
-        """A reading of that instant has come."""
-        self._heard_ns = min(t_ns, self._clock.now_ns())
-        self._why_not = ""
-        if self._awaited:
-            self._arrived.set()
-
-    def invalid(self, why: str) -> None:
-        """A reading has come that tells no force."""
-        self._why_not = why
+    def take(self, sample: ForceSample) -> None:
+        """A reading has come."""
+        self._data.take(sample)
 
     @property
     def complaint(self) -> str:
         """What is wrong with the data now; empty if they are valid and fresh."""
-        if self._why_not:
-            return f"{self._name} says {self._why_not}"
-        age_ns = self._clock.now_ns() - self._heard_ns
-        if age_ns <= self._stale_after_ns:
-            return ""
-        age = f" for {age_ns / NS_PER_MS:.0f} ms" if self._heard_ns >= 0 else ""
-        return f"no reading has come from {self._name}{age}{self._busy}"
+        why = self._data.complaint
+        return f"{why}{self._busy}" if why and not self._data.invalid else why
 
     @property
     def _busy(self) -> str:
@@ -99,7 +86,7 @@ class ForceFlow:
         with self._beginning:
             self._keep_streaming(sensor, stage)
             if self.complaint:
-                self._await_reading()
+                self._data.wait(_FIRST_READING_S)
         if self.complaint:
             raise UnsafeError(
                 f"{stage} moves only while valid forces come: {self.complaint}",
@@ -141,16 +128,3 @@ class ForceFlow:
             self._late_ns, self._late_until_ns = late_ns, now_ns + _REMEMBERED_NS
         self._looked_ns = now_ns
         self._on_beat()
-
-    def _await_reading(self) -> None:
-        deadline_ns = self._clock.now_ns() + round(_FIRST_READING_S * NS_PER_S)
-        self._awaited = True
-        try:
-            while self.complaint and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
-                self._arrived.clear()
-                if not self._arrived.wait(left_ns / NS_PER_S):
-                    break
-        except ClockError:
-            pass  # a callback on a simulated clock cannot wait for what comes later
-        finally:
-            self._awaited = False

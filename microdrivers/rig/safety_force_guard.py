@@ -175,12 +175,10 @@ class ForceGuard:
         force_uN = self._judged_uN(sample)
         if abs(sample.tare_uN) > self.settings.zero_uN and sample.tare_uN != self._doubted_tare_uN:
             self._doubt_tare(sample.tare_uN)
+        self._flow.take(sample)
         if math.isnan(force_uN):
-            self._flow.invalid(DISCONNECTED if DISCONNECTED in sample.flags else "no number")
             self._hold_while_blind()
-            return
-        self._flow.heard(sample.t_ns)
-        if self._is_over(force_uN):
+        elif self._is_over(force_uN):
             self._hold_over_limit(force_uN, sample)
         elif self.tripped and abs(force_uN) <= _BELOW_SHARE * self.settings.max_force_uN:
             self._end_trip()
@@ -195,8 +193,7 @@ class ForceGuard:
 
     def _load_uN(self, sample: ForceSample) -> float:
         """The raw force less as much of the tare as a zero can be off; of a saturated sensor, where it stands."""
-        zero_uN = self.settings.zero_uN
-        return sample.raw_uN - min(max(sample.tare_uN, -zero_uN), zero_uN)
+        return sample.raw_uN - self.settings.zero_of_uN(sample.tare_uN)
 
     def _is_over(self, force_uN: float) -> bool:
         return abs(force_uN) > self.settings.max_force_uN

@@ -70,6 +70,10 @@ class ForceGuardSettings(DeviceSettings):
         """The largest tare that is a zero and not a load."""
         return _ZERO_SHARE * self.max_force_uN if self.zero_within_uN is None else self.zero_within_uN
 
+    def zero_of_uN(self, tare_uN: float) -> float:
+        """As much of a tare as is a zero; the rest is load."""
+        return min(max(tare_uN, -self.zero_uN), self.zero_uN)
+
 
 class KeepOutBox(DeviceSettings):
     """A box in the rig's frame that no tool's tip may enter."""

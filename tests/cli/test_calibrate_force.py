@@ -46,7 +46,7 @@ def test_who_presses_without_a_guard_is_told_before(run, tmp_path):
 def test_a_result_is_never_written_over(run, tmp_path):
     (tmp_path / "result.json").write_text("{}")
     result = run("calibrate", "force", "--no-record", "--out", tmp_path)
-    assert (result.exit_code, "a result is never written over" in result.stderr) == (1, True)
+    assert (result.exit_code, "a result is never overwritten" in result.stderr) == (1, True)
     assert run("calibrate", "optics", "--no-record", "--out", tmp_path).exit_code == 1
     assert [file.name for file in tmp_path.iterdir()] == ["result.json"]
 
@@ -101,7 +101,7 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     assert source.finished == 1
     assert len(measured(tmp_path)) == 60
     told = capsys.readouterr().err
-    assert "record.csv; nothing follows from it: no contact" in told
+    assert "record.csv; it cannot be analysed: no contact" in told
     assert "to analyse it" not in told
     assert source.whereabouts in told
     assert not (tmp_path / "result.json").exists()

@@ -108,7 +108,7 @@ def test_record_needs_an_end_where_time_flies_and_a_file_that_is_new(run, tmp_pa
     (tmp_path / "a.mcap").write_text("mine")
     result = run("record", shipped_rig("microscope"), "--fake", "--for", 1, "--out", "a.mcap")
     assert result.exit_code == 1
-    assert "never written over" in result.stderr
+    assert "never overwritten" in result.stderr
     assert (tmp_path / "a.mcap").read_text() == "mine"
 
 

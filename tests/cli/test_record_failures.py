@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from microdrivers.configs import shipped_rig
+from microdrivers.recording.mcap_writer import McapWriter
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.recorder import Recorder
 
@@ -167,12 +168,26 @@ def test_a_recording_that_somebody_else_touches_is_told(run, tmp_path, prepared,
 
     prepared(lambda rig: rig.clock.call_at(rig.clock.now_ns() + 50_000_000, remove, name="somebody"))
     result = run("record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "zoom")
-    assert (result.exit_code, "spoilt: while it was written somebody" in result.stdout) == (1, True), result.output
+    told = "corrupt: another program wrote to it" if how == "written to" else "gone: it, or its disk, was removed"
+    assert (result.exit_code, told in result.stdout) == (1, True), result.output
     if how == "written to":
         assert "something follows it" in run("info", "a.mcap").stdout
 
 
-def test_a_calibration_says_that_its_recording_was_spoilt(run, tmp_path, monkeypatch):
+def test_a_recording_whose_end_was_interrupted_is_not_called_complete(run, tmp_path, monkeypatch):
+    def interrupt(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(McapWriter, "finish", interrupt)
+        result = run("record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "zoom")
+    told = "a.mcap: 0.0 MB, interrupted before its end was written; `microdrivers recording repair` makes it whole"
+    assert (result.exit_code, told in result.stdout) == (1, True), result.output
+    assert run("recording", "repair", "a.mcap").exit_code == 0
+    assert Recording(tmp_path / "a.repaired.mcap").topics["zoom"].count > 0
+
+
+def test_a_calibration_says_that_its_recording_is_gone(run, tmp_path, monkeypatch):
     def close_and_lose(self, close=Recorder.close):
         close(self)
         self.file.unlink(missing_ok=True)
@@ -180,7 +195,7 @@ def test_a_calibration_says_that_its_recording_was_spoilt(run, tmp_path, monkeyp
     monkeypatch.setattr(Recorder, "close", close_and_lose)
     result = run("calibrate", "optics", "--frames", 20, "--zoom-to", 0.9, "--out", "run")
     note = json.loads((tmp_path / "run" / "result.json").read_text())["notes"][-1]
-    assert (result.exit_code, note.startswith("The recording run.mcap is spoilt")) == (1, True)
+    assert (result.exit_code, note.startswith("The recording run.mcap is gone: it")) == (1, True)
 
 
 def test_a_contact_sheet_is_whole_or_not_there(run, optics_recording, tmp_path):

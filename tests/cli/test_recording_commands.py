@@ -81,7 +81,7 @@ def test_info(run, run_file, tmp_path):
     assert "lost       nothing" in result.stdout
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
     again = run("info", run_file, "--contact-sheet", "sheet.png")
-    assert (again.exit_code, "a contact sheet is never written over" in again.stderr) == (1, True)
+    assert (again.exit_code, "a contact sheet is never overwritten" in again.stderr) == (1, True)
     other = run("info", run_file, "--contact-sheet", "sheet.txt")
     assert (other.exit_code, "must end in .png" in other.stderr) == (1, True)
     assert not (tmp_path / "sheet.txt").exists()
@@ -118,7 +118,7 @@ def test_times_out_of_order_and_dropped_samples_are_told_to_who_uses_them(run, o
         for topic, sample in whole.samples():
             later = 10**9 if (topic, sample.seq) == ("stage", 3) else 0
             bus.topic(topic, type(sample)).publish(msgspec.structs.replace(sample, t_ns=sample.t_ns + later))
-        recorder._lost("zoom", 2, "the disk does not keep up")
+        recorder._out.counts["zoom"].refused += 2  # the disk does not keep up
     for command in (
         ("replay", "a.mcap"), ("export", "a.mcap", "--to", "csv"), ("calibrate", "optics", "--replay", "a.mcap"),
         ("calibrate", "optics", "--replay", "a.mcap", "--json"), ("calibrate", "force", "--replay", "a.mcap"),
@@ -201,7 +201,7 @@ def test_a_replay_never_writes_over_a_result(run, run_file, force_recording, tmp
         folder.mkdir()
         (folder / "result.json").write_text("mine")
         result = run("calibrate", kind, "--replay", source, "--out", folder)
-        assert (result.exit_code, "a result is never written over" in result.stderr) == (1, True)
+        assert (result.exit_code, "a result is never overwritten" in result.stderr) == (1, True)
         assert [(file.name, file.read_text()) for file in folder.iterdir()] == [("result.json", "mine")]
 
 
@@ -291,7 +291,7 @@ def test_export_goes_beside_the_recording(run, run_file, tmp_path):
     result = run("export", run_file, "--to", "csv", "--topics", "stage, zoom")
     assert result.exit_code == 0, result.output
     assert sorted(file.name for file in (tmp_path / "run-export").iterdir()) == ["stage.csv", "zoom.csv"]
-    assert "never writes over" in run("export", run_file, "--to", "csv").stderr
+    assert "never overwrites" in run("export", run_file, "--to", "csv").stderr
     result = run("export", run_file, "--to", "video")
     assert "loses detail" in result.stdout
 
@@ -300,7 +300,7 @@ def test_analyse(run, run_file, tmp_path):
     result = run("analyse", ".", "--out", "t.csv")
     assert result.exit_code == 0, result.output
     assert ": 1 recording, 0 with errors" in result.stdout
-    assert "never written over" in run("analyse", ".", "--out", "t.csv").stderr
+    assert "never overwritten" in run("analyse", ".", "--out", "t.csv").stderr
 
 
 def rewrite(source, file, change=lambda sample: [sample]):

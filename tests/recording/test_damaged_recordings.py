@@ -1,6 +1,10 @@
 """Torn, damaged, empty, foreign and future files: what is delivered is what was written, the rest is told."""
 
+import errno
+import os
 import random
+import types
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,11 +16,15 @@ from mcap.writer import Writer
 
 from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import ForceSample
+from microdrivers.recording import reader
+from microdrivers.recording.codec import codec_of
 from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording, RecordingError
-from microdrivers.recording.header import RecordingHeader
+from microdrivers.recording.header import HEADER_RECORD, PROFILE, RecordingHeader, to_metadata
+from microdrivers.recording.mcap_writer import ChannelKey, McapWriter
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.recorder import Recorder
 from microdrivers.recording.repair import repair
+from microdrivers.recording.schemas import schema_data, schema_name
 
 SLOW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -238,9 +246,78 @@ def test_times_that_run_backwards_are_counted(stage):
     assert (found.unsorted, found.first_t_ns, found.last_t_ns) == (1, 5, 20)
 
 
+PAGE = 4096
+
+
+@pytest.fixture
+def bad_disk(monkeypatch):
+    """Makes pages of a file unreadable: a read ends before one, and fails at one, as it does on Linux."""
+    pages = set()
+
+    def pread(descriptor, size, offset, pread=os.pread):
+        bad = [page for page in range(offset // PAGE, (offset + size - 1) // PAGE + 1) if page in pages]
+        if bad and bad[0] * PAGE <= offset:
+            raise OSError(errno.EIO, "Input/output error")
+        return pread(descriptor, bad[0] * PAGE - offset if bad else size, offset)
+
+    monkeypatch.setattr(os, "pread", pread)
+    return pages
+
+
+def test_what_a_failing_disk_does_not_give_is_told_and_the_rest_is_repaired(recorded, same, tmp_path, bad_disk):
+    last = recorded.file.stat().st_size // PAGE
+    for page in range(1, last + 1):
+        bad_disk.add(page)
+        told = f"{PAGE} bytes at byte {page * PAGE} cannot be read: Input/output error"
+        with Recording(recorded.file) as recording:
+            found = list(recording.samples())
+            assert told in [str(loss) for loss in recording.losses]
+        assert len(recorded.published) - 150 < len(found)
+        check_is_part_of(same, found, recorded.published)
+        report = repair(recorded.file, tmp_path / f"{page}.mcap")
+        bad_disk.clear()
+        assert str(report.losses[0]) == told
+        check_official(report.out)
+        assert len(list(Recording(report.out).samples())) == len(found)
+    bad_disk |= {3, 4, 7}
+    told = [f"{2 * PAGE} bytes at byte {3 * PAGE}", f"{PAGE} bytes at byte {7 * PAGE}"]
+    with Recording(recorded.file) as recording:
+        assert [str(loss).partition(" cannot be read")[0] for loss in recording.losses[:2]] == told
+    bad_disk.add(0)
+    with pytest.raises(ConfigError, match="cannot be read: Input/output error"):
+        Recording(recorded.file)
+
+
+def test_damage_is_found_also_where_asserts_are_left_out(recorded, tmp_path):
+    data = bytearray(recorded.file.read_bytes())
+    place = Recording(recorded.file)._scan.chunks[4]
+    data[place.offset + place.length - 1] ^= 1
+    (tmp_path / "damaged.mcap").write_bytes(data)
+    optimised = types.ModuleType(reader.__name__)
+    exec(compile(Path(reader.__file__).read_text(), reader.__file__, "exec", optimize=1), vars(optimised))
+    [loss] = optimised.Recording(tmp_path / "damaged.mcap").losses
+    assert "its CRC does not match" in loss.what
+
+
+def test_log_times_that_run_backwards_are_told_by_a_repair(tmp_path):
+    file = tmp_path / "rewritten.mcap"
+    with file.open("xb", buffering=0) as output:
+        writer = McapWriter(output, profile=PROFILE, library="another program")
+        writer.add_metadata(HEADER_RECORD, to_metadata(RecordingHeader(source="fake")))
+        key = ChannelKey("force", schema_name(ForceSample), schema_data(ForceSample))
+        for t_ns in (5, 9, 7, 8, 20):
+            data = codec_of(ForceSample).encode(ForceSample(t_ns=t_ns, device="x", force_uN=0.0, raw_uN=0.0))
+            writer.add_message(writer.channel(key), data, sequence=0, log_ns=t_ns, publish_ns=t_ns)
+            writer.flush()
+        writer.finish()
+    report = repair(file, tmp_path / "out.mcap")
+    assert (report.backwards, report.messages, report.losses) == ({"force": 1}, {"force": 5}, [])
+
+
 def test_repair_never_writes_over_anything(recorded, tmp_path):
-    with pytest.raises(ConfigError, match="the file exists"):
+    with pytest.raises(ConfigError, match="the file already exists"):
         repair(recorded.file, recorded.file)
     report = repair(recorded.file, tmp_path / "out.mcap")
     assert (report.losses, report.messages["force"], report.messages["camera"]) == ([], 500, 10)
+    assert report.backwards == {}
     assert Recording(report.out).attachments == Recording(recorded.file).attachments

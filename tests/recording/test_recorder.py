@@ -122,7 +122,7 @@ def test_arrivals_are_kept_by_host_and_survive_a_kill(stage):
     orders = []
     with stage.recorder() as recorder:
         recorder.follow_arrivals("optics", orders)
-        recorder.note_arrivals("force", [5, 3])
+        recorder.follow_arrivals("force", [5, 3])
         for index in range(300):
             stage.clock.sleep(0.001)
             stage.force(index)
@@ -138,10 +138,10 @@ def test_arrivals_are_kept_by_host_and_survive_a_kill(stage):
 
 def test_an_existing_file_is_never_written_over(stage):
     with stage.recorder():
-        with pytest.raises(ConfigError, match="the file exists"):
+        with pytest.raises(ConfigError, match="the file already exists"):
             stage.recorder()
         stage.force(0)
-    with pytest.raises(ConfigError, match="the file exists"):
+    with pytest.raises(ConfigError, match="the file already exists"):
         stage.recorder()
     assert len(read(stage.file)) == 1
 

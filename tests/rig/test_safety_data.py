@@ -43,7 +43,7 @@ def test_a_sensor_that_falls_off_stops_a_moving_stage_and_nothing_is_retracted(g
     move = guarded.stage.start_move_to(x_um=-300.0, speed_um_s=50.0)
     guarded.clock.sleep(0.3)
     guarded.amplifier.disconnect_sensor(guarded.clock.now_ns())
-    with pytest.raises(MoveCancelled, match="probe_force says DISCONNECTED"):
+    with pytest.raises(MoveCancelled, match="probe_force reports DISCONNECTED"):
         move.wait()
     first = next(sample for sample in guarded.forces if DISCONNECTED in sample.flags)
     assert guarded.stops()[0].t_ns - first.t_ns < 5 * NS_PER_MS
@@ -62,7 +62,7 @@ def test_a_stage_at_rest_is_left_alone_and_does_not_start_until_forces_come_agai
         lambda: guarded.stage.reference(["x"]),
         lambda: guarded.rig.safety.begin(STAGE),
     ):
-        with pytest.raises(UnsafeError, match="only while valid forces come: probe_force says DISCONNECTED") as caught:
+        with pytest.raises(UnsafeError, match="valid forces come: probe_force reports DISCONNECTED") as caught:
             start()
         assert caught.value.moved == "no"
         assert "retract()" in caught.value.remedy

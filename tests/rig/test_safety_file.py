@@ -89,9 +89,9 @@ MISTAKES = {
     "unit in the value": ("max_force_uN: 1500", "max_force_uN: 1.5 mN", "is not a number", "unit is part of the key"),
     "negative limit": ("max_force_uN: 1500", "max_force_uN: -3", "greater than 0", "correct the value"),
     "unknown sensor": ("sensor: probe_force", "sensor: prob", "there is no device 'prob'", "name one of"),
-    "no sensor": ("sensor: probe_force", "sensor: zoom", "'zoom' is no ForceSensor", "probe_force, gripper_force"),
+    "no sensor": ("sensor: probe_force", "sensor: zoom", "'zoom' is not a ForceSensor", "probe_force, gripper_force"),
     "unknown stage": ("stage: probe_stage", "stage: prob", "there is no device 'prob'", "probe_stage, gripper_stage"),
-    "not a fine stage": ("stage: probe_stage", "stage: zoom", "is no FineStage", "probe_stage, gripper_stage"),
+    "not a fine stage": ("stage: probe_stage", "stage: zoom", "is not a FineStage", "probe_stage, gripper_stage"),
     "another stage's sensor": (
         "stage: probe_stage", "stage: gripper_stage", "not carried by gripper_stage but by probe_stage", "carried_by",
     ),
@@ -103,7 +103,7 @@ MISTAKES = {
     ),
     "guarded twice": (
         GUARD, f"{GUARD}\n    - {PROBE_GUARD}",
-        "'probe_force' stands here twice", "keep one",
+        "'probe_force' is listed twice", "keep one",
     ),
     "a speed that it never has": (GUARD, "max_speed_um_s: 5000", "probe_stage moves at 1000 µm/s", "leave it out"),
     "a zero beyond the limit": (GUARD, "zero_within_uN: 1600", "hide the whole limit", "less than"),
@@ -113,7 +113,7 @@ MISTAKES = {
     "a flat point": ("min_um: [0, 0, -5000]", "min_um: [0, 0]", "a point is needed here: [x, y, z]", "correct"),
     "two boxes of a name": (
         BOX, f"    - {{name: slide, min_um: [0, 0, 0], max_um: [1, 1, 1]}}\n{BOX}",
-        "'slide' stands here twice", "keep one",
+        "'slide' is listed twice", "keep one",
     ),
 }  # fmt: skip
 

@@ -378,3 +378,14 @@ def test_samples_of_others_are_none_of_its_business(guarded):
     assert guarded.rules() == []
     assert guarded.rig.safety.limit_uN(SENSOR) == LIMIT_UN
     assert guarded.rig.safety.limit_uN("other_force") is None
+
+
+@pytest.mark.parametrize(("tare_uN", "limit_uN"), [(60.0, LIMIT_UN), (300.0, 800.0), (-300.0, 1200.0)])
+def test_the_limit_of_a_tared_push_is_where_the_guard_trips(guarded, tare_uN, limit_uN):
+    guarded.press(tare_uN)
+    guarded.sensor.tare(0.5)
+    guarded.press(lambda t_ns: tare_uN + guarded.spring_uN(t_ns))
+    press_too_hard(guarded, speed_um_s=20.0)
+    assert guarded.rig.safety.limit_uN(SENSOR, tare_uN=tare_uN) == limit_uN
+    assert "force limit" in guarded.rules()
+    assert max(sample.force_uN for sample in guarded.forces) == pytest.approx(limit_uN, rel=0.02)

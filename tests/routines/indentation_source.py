@@ -35,6 +35,7 @@ class MadeUpSource:
     """
 
     past_run = PastRun()
+    past_settings = None
     repeatable = True
     whereabouts = ""
 

@@ -117,7 +117,7 @@ def test_a_force_that_the_camera_tells_after_the_release_is_said(characterised):
     left = [msgspec.structs.replace(force, force_uN=40.0, flags=frozenset({"MAY_BE_RELEASED"})) for force in last]
     spoilt = result_of(run._replace(check=run.check._replace(forces=[*run.check.forces[:-30], *left])))
     assert spoilt.vision_check.left_over_uN == 40.0
-    assert any("told up to 40 µN after the tip had left" in note for note in spoilt.notes)
+    assert any("still indicated up to 40 µN after contact was lost" in note for note in spoilt.notes)
 
 
 def test_a_zero_of_the_sensor_is_no_force_on_the_specimen(characterised):

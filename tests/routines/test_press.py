@@ -1,6 +1,8 @@
 """The live experiment on an emulated probe: whatever ends it, the probe goes away and what was measured is kept."""
 
 import re
+from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -12,10 +14,11 @@ from microdrivers.core.errors import (
     MoveCancelled,
     NoContact,
     OutOfRange,
+    StaleCalibration,
     TargetLost,
     UnsafeError,
 )
-from microdrivers.core.units import NS_PER_S
+from microdrivers.core.units import NS_PER_S, Range
 from microdrivers.estimators.vision.contact_patch import contact_patch
 from microdrivers.rig import open_rig
 from microdrivers.rig.safety_keep_out import KeepOut
@@ -199,7 +202,7 @@ def test_a_limit_that_ends_the_press_at_once_is_named(rig):
     assert not isinstance(error, NoContact)
     assert "turned back at" in error.what
     assert "beyond the limit of 20 µN" in error.what
-    assert "press slower than 40 µm/s" in error.remedy
+    assert "press more slowly than 40 µm/s" in error.remedy
     assert len(characterisation.first.frames) > 20
     assert probe_um(rig) > -490.0 + AWAY_UM
     assert characterisation.partial(error) is None
@@ -224,6 +227,47 @@ def test_settings_that_cannot_be_are_refused(rig):
     for change in ({"speed_um_s": 300.0}, {"depth_um": 0.0}, {"max_force_uN": 1600.0}):
         with pytest.raises(OutOfRange):
             PressExperiment(rig, SHORT._replace(**change))
+
+
+@pytest.mark.parametrize(
+    ("range_uN", "guard_uN", "tare_uN", "limit_uN"),
+    [
+        ((-2000.0, 2000.0), None, 0.0, 1600.0),
+        ((0.0, 2000.0), None, 0.0, 1600.0),
+        ((-100.0, 2000.0), None, 0.0, 1600.0),
+        ((-2000.0, 2000.0), None, 450.0, 1240.0),
+        ((-2000.0, 2000.0), None, -450.0, 1960.0),
+        ((-2000.0, 2000.0), 1500.0, 0.0, 1200.0),
+        ((-2000.0, 2000.0), 1500.0, 600.0, 1120.0),
+        ((0.0, 500.0), 1500.0, 0.0, 400.0),
+    ],
+)
+def test_a_push_may_use_most_of_what_guard_and_sensor_leave(range_uN, guard_uN, tare_uN, limit_uN):
+    known = {"guard_uN": guard_uN, "tare_uN": tare_uN}
+    assert SHORT.limit_uN(Range(*range_uN), **known) == pytest.approx(limit_uN)
+    assert SHORT._replace(max_force_uN=300.0).limit_uN(Range(*range_uN), **known) == 300.0
+    with pytest.raises(OutOfRange, match="is not between 0 and"):
+        SHORT._replace(max_force_uN=limit_uN / 0.8 + 1.0).limit_uN(Range(*range_uN), **known)
+
+
+@pytest.mark.parametrize(("end_uN", "tare_uN"), [(0.0, 0.0), (2000.0, 2001.0)])
+def test_a_sensor_that_can_feel_no_push_is_refused(end_uN, tare_uN):
+    with pytest.raises(OutOfRange, match="leaves no force to press with"):
+        SHORT.limit_uN(Range(-2000.0, end_uN), guard_uN=1500.0, tare_uN=tare_uN)
+
+
+def test_a_zoom_that_cannot_be_asked_is_not_known_and_contradicts_a_calibration(rig, monkeypatch):
+    camera = rig.devices["camera_fine"]
+    now = camera.settings
+    zoom = sight.zoom_of(rig)
+    result = SimpleNamespace(
+        valid_for=SimpleNamespace(camera=camera.name, zoom=zoom, binning=now.binning, roi=tuple(now.roi))
+    )
+    sight._require_same(result, camera, rig, Path("result.json"))
+    monkeypatch.setattr(rig.devices["zoom"], "link", "closed")
+    assert sight.zoom_of(rig) is None
+    with pytest.raises(StaleCalibration, match="and zoom cannot be asked for its own"):
+        sight._require_same(result, camera, rig, Path("result.json"))
 
 
 def test_what_stage_and_guard_forbid_is_refused_before_anything_moves(rig, monkeypatch):

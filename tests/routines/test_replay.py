@@ -8,6 +8,8 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock, utc_now
 from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.core.samples import Frame, XYThetaSample
+from microdrivers.estimators.force.identify import IdentificationSettings
+from microdrivers.estimators.optics.calibrator import CalibratorSettings
 from microdrivers.recording.header import describe_recording
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.recorder import Recorder
@@ -45,7 +47,10 @@ def calibrated(tmp_path_factory):
         recorder_of(file, rig) as recorder,
     ):
         source = CircleExperiment(rig, CircleSettings(frames=60, change_after_frame=30))
-        run = calibrate_optics(source, on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals))
+        settings = CalibratorSettings(forgetting=0.97, flush_frames=4, sigma_drift_um_s=0.02)
+        run = calibrate_optics(
+            source, settings=settings, on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals)
+        )
     return run, file
 
 
@@ -53,6 +58,7 @@ def test_a_recorded_calibration_gives_the_same_bits(calibrated):
     run, file = calibrated
     with Recording(file) as recording:
         again = calibrate_optics(OpticsReplay(recording))
+    assert again.settings == run.settings
     assert bits(again.estimates) == bits(run.estimates)
     assert again.arrivals == run.arrivals
     assert again.optics == run.optics
@@ -199,7 +205,7 @@ def poses(file, orders, *, arrivals=()):
                     moving=False, on_target=True, referenced=True,
                 )
             )  # fmt: skip
-        recorder.note_arrivals("host", arrivals)
+        recorder.follow_arrivals("host", arrivals)
     return Recording(file)
 
 
@@ -279,7 +285,9 @@ def indented(tmp_path_factory):
     ):
         source = PressExperiment(rig, SHORT)
         characterisation = Characterisation(
-            source, on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals)
+            source,
+            on_host=lambda host, inbox: recorder.follow_arrivals(host, inbox.arrivals),
+            settings=IdentificationSettings(around_reversal=3),
         )
         run = characterisation.run()
     return run, file
@@ -306,7 +314,7 @@ def test_the_experiment_notes_what_its_replay_needs(indented):
     with Recording(file) as recording:
         kinds = [sample.kind for _, sample in recording.samples(("routine",))]
         frames = sum(isinstance(sample, Frame) for _, sample in recording.samples(("camera_fine",)))
-    assert kinds == [READY, "force/begin", "force/end", "force/begin", "force/end", "force/done"]
+    assert kinds == ["force/settings", READY, "force/begin", "force/end", "force/begin", "force/end", "force/done"]
     assert frames > 100
 
 

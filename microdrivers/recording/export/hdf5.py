@@ -122,11 +122,9 @@ class Hdf5File:
 
 
 class Hdf5Topic:
-    """Writes one topic.
+    """Writes one topic."""
 
-    Attributes:
-        verify: raises OSError if something could not be written so far.
-    """
+    left_out = 0
 
     def __init__(
         self,
@@ -138,7 +136,7 @@ class Hdf5Topic:
         start_ns: int,
         check: Callable[[], None],
     ) -> None:
-        self.verify = check
+        self._check = check
         self.batch = _FRAMES if sample_type is Frame else 16_384
         self._h5py = h5py
         self._group = group
@@ -205,6 +203,14 @@ class Hdf5Topic:
 
     def close(self) -> None:
         """Nothing is kept back."""
+
+    def verify(self) -> None:
+        """Look whether the disk has taken all of it so far.
+
+        Raises:
+            OSError: it has not.
+        """
+        self._check()
 
 
 def text_widths(recording: Recording, topics: list[str]) -> Mapping[str, Mapping[str, int]]:

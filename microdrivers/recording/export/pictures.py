@@ -65,6 +65,7 @@ class ImageFolder:
     """
 
     batch = 1
+    left_out = 0
 
     def __init__(self, folder: Path, tracks: list[Track], *, start_ns: int) -> None:
         folder.mkdir()
@@ -98,6 +99,9 @@ class ImageFolder:
     def close(self) -> None:
         """Complete the table."""
         self._stream.close()
+
+    def verify(self) -> None:
+        """`write` and `close` have told."""
 
 
 class VideoFile:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, get_args
 
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import Frame, Sample
-from microdrivers.recording.channels import literal
-from microdrivers.recording.export.hdf5 import Hdf5File, Hdf5Topic, text_widths
+from microdrivers.recording.channels import literal, matches
+from microdrivers.recording.export.hdf5 import Hdf5File, text_widths
 from microdrivers.recording.export.pictures import ImageFolder, VideoFile, track_of
 from microdrivers.recording.export.tables import CsvTopic, ParquetTopic
 from microdrivers.recording.export.target import file_names, staged
@@ -24,19 +24,29 @@ Format = Literal["csv", "parquet", "hdf5", "images", "video"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 _NEEDS: Mapping[Format, str] = {"parquet": "pyarrow", "hdf5": "h5py"}
+_FRAMES_ALONE: tuple[Format, ...] = ("images", "video")
+_WITH_IMAGES: tuple[Format, ...] = ("hdf5", *_FRAMES_ALONE)
 _REPORT_EVERY = 100
 
 
 class TopicWriter(Protocol):
-    """Writes one topic, `batch` samples at a time."""
+    """Writes one topic, `batch` samples at a time.
+
+    Attributes:
+        left_out: samples that have no place in the file.
+    """
 
     batch: int
+    left_out: int
 
     def write(self, samples: list[Sample]) -> None:
         """Append samples."""
 
     def close(self) -> None:
         """Complete what was written."""
+
+    def verify(self) -> None:
+        """Raise OSError or MicrodriversError if what was written and closed is not whole."""
 
 
 class ExportReport(NamedTuple):
@@ -76,72 +86,72 @@ def export_recording(
         optional_module(_NEEDS[to])
     chosen = _choose(recording, to, topics)
     names = file_names(chosen)
-    start = start_ns(recording)
-    total = sum(found.count for found in chosen.values())
-    written = dict.fromkeys(chosen, 0)
-    with ExitStack() as outer:
-        suffix = {"csv": ".csv", "parquet": ".parquet", "images": "", "video": ".avi"}.get(to, "")
-        files = {topic: f"{recording.file.stem}.h5" if to == "hdf5" else f"{names[topic]}{suffix}" for topic in chosen}
-        flaws = "".join(f"{flaw}\n" for flaw in recording.flaws)
-        told = f"{recording.file.stem}-flaws.txt"
-        tells = bool(flaws) and not _holds(out / told, flaws)
-        stage = outer.enter_context(staged(out, dict.fromkeys([*files.values(), *([told] if tells else [])])))
+    suffix = {"csv": ".csv", "parquet": ".parquet", "images": "", "video": ".avi"}.get(to, "")
+    files = {topic: f"{recording.file.stem}.h5" if to == "hdf5" else f"{names[topic]}{suffix}" for topic in chosen}
+    flaws = "".join(f"{flaw}\n" for flaw in recording.flaws)
+    told = f"{recording.file.stem}-flaws.txt"
+    tells = bool(flaws) and not _holds(out / told, flaws)
+    with staged(out, dict.fromkeys([*files.values(), *([told] if tells else [])])) as stage:
         if tells:
             (stage / told).write_text(flaws, encoding="utf-8")
         writers: dict[str, TopicWriter] = {}
         with ExitStack() as stack:
-            make = _maker(recording, to, stage, files, names, start, stack, list(chosen))
+            make = _maker(recording, to, stage, files, names, stack, list(chosen))
             for topic, found in chosen.items():
                 writers[topic] = make(topic, found)
                 stack.callback(writers[topic].close)
-            waiting: dict[str, list[Sample]] = {topic: [] for topic in chosen}
-            done = 0
-            for topic, sample in recording.samples([literal(topic) for topic in chosen]):
-                batch = waiting[topic]
-                batch.append(sample if to in ("hdf5", "images", "video") else _light(sample))
-                written[topic] += 1
-                done += 1
-                if len(batch) >= writers[topic].batch:
-                    writers[topic].write(batch)
-                    waiting[topic] = []
-                if done % _REPORT_EVERY == 0:
-                    on_progress(done, total)
-            for topic, batch in waiting.items():
-                if batch:
-                    writers[topic].write(batch)
-            on_progress(done, total)
+            written = _write_batches(recording, writers, keeps_images=to in _WITH_IMAGES, on_progress=on_progress)
         for writer in writers.values():
-            if isinstance(writer, (Hdf5Topic, VideoFile)):
-                writer.verify()
+            writer.verify()
     remarks = [
         f"{topic}: {writer.left_out} frames of another size than the first one were left out"
         for topic, writer in writers.items()
-        if isinstance(writer, VideoFile) and writer.left_out
+        if writer.left_out
     ]
     if flaws:
         remarks.append(f"{out / told}: what is wrong with the recording")
-    by_file: dict[Path, int] = {}
+    by_file = Counter[Path]()
     for topic, number in written.items():
-        by_file[out / files[topic]] = by_file.get(out / files[topic], 0) + number
+        by_file[out / files[topic]] += number
     return ExportReport(by_file, recording.losses, remarks)
+
+
+def _write_batches(
+    recording: Recording,
+    writers: Mapping[str, TopicWriter],
+    *,
+    keeps_images: bool,
+    on_progress: Callable[[int, int], object],
+) -> Counter[str]:
+    """Hand each topic's samples to its writer, and count them."""
+    total = sum(recording.topics[topic].count for topic in writers)
+    written = Counter(dict.fromkeys(writers, 0))
+    waiting: dict[str, list[Sample]] = {topic: [] for topic in writers}
+    for done, (topic, sample) in enumerate(recording.samples([literal(topic) for topic in writers]), 1):
+        batch = waiting[topic]
+        batch.append(sample if keeps_images else without_image(sample))
+        written[topic] += 1
+        if len(batch) >= writers[topic].batch:
+            writers[topic].write(batch)
+            waiting[topic] = []
+        if done % _REPORT_EVERY == 0:
+            on_progress(done, total)
+    for topic, batch in waiting.items():
+        if batch:
+            writers[topic].write(batch)
+    on_progress(written.total(), total)
+    return written
 
 
 def _choose(recording: Recording, to: Format, patterns: Collection[str] | None) -> dict[str, TopicSummary]:
     there = {name: found for name, found in recording.topics.items() if found.count}
-    if to in ("images", "video"):
+    if to in _FRAMES_ALONE:
         there = {name: found for name, found in there.items() if found.sample_type is Frame}
-    chosen = {
-        name: found
-        for name, found in there.items()
-        if patterns is None or any(fnmatchcase(name, pattern) for pattern in patterns)
-    }
-    unknown = [p for p in patterns or () if not any(fnmatchcase(name, p) for name in there)]
+    chosen = {name: found for name, found in there.items() if matches(name, patterns)}
+    unknown = [pattern for pattern in patterns or () if not any(matches(name, [pattern]) for name in there)]
     if unknown or not chosen:
-        what = (
-            "no frames"
-            if to in ("images", "video") and not there
-            else f"nothing on {', '.join(unknown) or 'any topic'}"
-        )
+        no_frames = to in _FRAMES_ALONE and not there
+        what = "no frames" if no_frames else f"nothing on {', '.join(unknown) or 'any topic'}"
         raise UnsupportedError(
             f"{recording.file} holds {what} to export to {to}",
             remedy=f"name some of {', '.join(there)}" if there else "`microdrivers info` tells what a file holds",
@@ -155,11 +165,11 @@ def _maker(
     stage: Path,
     files: Mapping[str, str],
     names: Mapping[str, str],
-    start: int,
     stack: ExitStack,
     topics: list[str],
 ) -> Callable[[str, TopicSummary], TopicWriter]:
     """What makes the writer of a topic."""
+    start = start_ns(recording)
     if to == "csv":
         return lambda topic, found: CsvTopic(stage / files[topic], found.sample_type, start_ns=start)
     if to == "parquet":
@@ -177,8 +187,3 @@ def _maker(
 def _holds(file: Path, text: str) -> bool:
     """Whether an earlier export of the recording has left that there."""
     return file.is_file() and file.read_bytes() == text.encode()
-
-
-def _light(sample: Sample) -> Sample:
-    """Tables hold no images: none need be kept until a batch is full."""
-    return without_image(sample) if isinstance(sample, Frame) else sample

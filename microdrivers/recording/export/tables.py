@@ -23,6 +23,7 @@ class CsvTopic:
     """
 
     batch = BATCH_SAMPLES
+    left_out = 0
 
     def __init__(self, file: Path, sample_type: type[Sample], *, start_ns: int) -> None:
         self._stream = file.open("x", encoding="utf-8", newline="")
@@ -40,6 +41,9 @@ class CsvTopic:
         """Complete the file."""
         self._stream.close()
 
+    def verify(self) -> None:
+        """`write` and `close` have told."""
+
 
 class ParquetTopic:
     """Writes one topic; fields carry `unit` and `description` as metadata.
@@ -49,6 +53,7 @@ class ParquetTopic:
     """
 
     batch = BATCH_SAMPLES
+    left_out = 0
 
     def __init__(self, file: Path, sample_type: type[Sample], *, topic: str, start_ns: int) -> None:
         self._arrow = optional_module("pyarrow")
@@ -86,6 +91,9 @@ class ParquetTopic:
     def close(self) -> None:
         """Complete the file."""
         self._writer.close()
+
+    def verify(self) -> None:
+        """`write` and `close` have told."""
 
 
 def _columns(samples: list[Sample], sample_type: type[Sample], start_ns: int) -> Mapping[str, Array]:

@@ -1,4 +1,4 @@
-"""Where an export goes: nothing is written over, and what was not finished is not left behind."""
+"""Where an export goes: nothing is overwritten, and what was not finished is not left behind."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def staged(out: Path, names: Iterable[str]) -> Iterator[Path]:
 def _refuse_existing(target: Path) -> None:
     if target.exists():
         raise ConfigError(
-            "it exists, and an export never writes over anything", file=str(target),
+            "it already exists, and an export never overwrites anything", file=str(target),
             remedy="choose another --out folder, or remove it",
         )  # fmt: skip
 

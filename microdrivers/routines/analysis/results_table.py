@@ -47,7 +47,7 @@ class ResultsTable:
             optional_module("pyarrow.parquet")
         if file.exists():
             raise ConfigError(
-                "the table exists, and is never written over", file=str(file), remedy="choose another --out"
+                "the table already exists, and is never overwritten", file=str(file), remedy="choose another --out"
             )
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

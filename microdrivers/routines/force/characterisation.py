@@ -25,8 +25,16 @@ from microdrivers.estimators.force.recursion import SpecimenRecursion
 from microdrivers.estimators.force.vision_force import VisionForce
 from microdrivers.estimators.vision.image_drift import ImageDrift
 from microdrivers.routines.force.frames import all_frames, drift_of, in_contact_uN, record_of, without_drift
-from microdrivers.routines.force.source import DONE, FrameTracker, IndentationSetup, IndentationSource, host_name
-from microdrivers.routines.notes import noted_ending
+from microdrivers.routines.force.source import (
+    DONE,
+    SETTINGS,
+    FrameTracker,
+    IndentationSetup,
+    IndentationSource,
+    Rests,
+    host_name,
+)
+from microdrivers.routines.notes import note, noted_ending
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
@@ -76,7 +84,8 @@ class Characterisation:
 
     `first` and `check` hold what was measured even if `run` ends with an error, and `interrupted` tells whether it was
     by Ctrl-C. `tells_nothing` is why `partial` found no specimen in it. `on_host` is told the estimators' inbox of each
-    indentation once it is there, for who records the order of arrival; `settings` say how to identify.
+    indentation once it is there, for who records the order of arrival; `settings` say how to identify: None as the
+    recorded run did, or as usual.
     """
 
     def __init__(
@@ -96,7 +105,7 @@ class Characterisation:
         self._source = source
         self._keep_samples = keep_samples
         self._on_host = on_host
-        self._settings = settings
+        self._settings = settings or source.past_settings or IdentificationSettings()
 
     def run(self, progress: Progress | None = None, *, check: bool = True) -> ForceRun:
         """Run it; on any way out the tool is away from the specimen.
@@ -107,6 +116,7 @@ class Characterisation:
             NoContact, IllConditioned and other DataError or CalibrationError: the record does not show or determine
                 a specimen. MicrodriversError: whatever the source raises. See `partial` for what is left then.
         """
+        note(self._source.bus, self._source.clock, SETTINGS, self._settings._asdict())
         with noted_ending(self._source.bus, self._source.clock, DONE, finish=self._source.finish) as ending:
             try:
                 self._experiment(progress or SilentProgress(), check=check)
@@ -161,75 +171,98 @@ class Characterisation:
             raise DataError(
                 f"the force leaves its noise in only {len(felt_uN)} of {len(frames)} frames, by up to "
                 f"{max(felt_uN):.4g} µN",
-                remedy="press slower or deeper, so that more frames see the specimen pressed",
+                remedy="press more slowly or deeper, so that more frames see the specimen pressed",
             ) from error
 
     def _indent(self, tracker: FrameTracker | None, model: SpecimenModel | None, progress: Progress) -> None:
         """One indentation: `first` or, with a model of the specimen, `check`; kept whatever ends it."""
-        source = self._source
+        session = _Session(self._source, tracker, model, keep_samples=self._keep_samples, on_host=self._on_host)
+        rests = None
+        try:
+            rests = self._source.indent(session.begin, progress)
+        finally:
+            indentation = session.end(rests)
+            if model is None:
+                self.first = indentation
+            else:
+                self.check = indentation
+
+
+class _Session:
+    """One indentation under way: its estimators, and what they have found.
+
+    Args:
+        source: presses, and has the bus.
+        tracker: finds the deformation in frames; None if deformations come as samples.
+        model: of the specimen, to read the force from the camera; None to estimate the specimen.
+        keep_samples, on_host: as of `Characterisation`.
+    """
+
+    def __init__(
+        self,
+        source: IndentationSource,
+        tracker: FrameTracker | None,
+        model: SpecimenModel | None,
+        *,
+        keep_samples: bool,
+        on_host: Callable[[str, Inbox], object],
+    ) -> None:
         bus, names = source.bus, source.names
-        estimator = IndentationEstimator(
+        self._clock = source.clock
+        self._keep_samples = keep_samples
+        self._on_host = on_host
+        self._host_name = host_name(1 if model is None else 2)
+        self._host: EstimatorHost | None = None
+        self._estimator = IndentationEstimator(
             tracker,
             IndentationMatcher(),
             recursion=SpecimenRecursion() if model is None else None,
             vision_force=VisionForce(model) if model is not None else None,
         )
-        found: list[Sample] = []
         deformations = bus.topic(names.deformation, DeformationSample)
-        topics: dict[type[Sample], Topic[Any]] = {
+        self._topics: dict[type[Sample], Topic[Any]] = {
             DeformationSample: deformations,
             IndentationSample: bus.topic("estimate/indentation", IndentationSample),
             SpecimenEstimate: bus.topic("estimate/specimen", SpecimenEstimate),
             VisionForceSample: bus.topic("estimate/force", VisionForceSample),
         }
-
-        def publish(sample: Sample) -> None:
-            found.append(sample)
-            topics[type(sample)].publish(sample)
-
         frames = bus.topic(names.camera, Frame) if names.camera is not None else deformations
-        hosts: list[EstimatorHost] = []
-        seen: list[DeformationSample] = []
-        watch = deformations.subscribe(seen.append)
+        self._inputs: tuple[Topic[Any], ...] = (bus.topic(names.sensor, ForceSample), frames)
+        self._found: list[Sample] = []
+        self._seen: list[DeformationSample] = []
+        self._watch = deformations.subscribe(self._seen.append)
 
-        def begin() -> None:
-            hosts.append(
-                EstimatorHost(
-                    source.clock,
-                    estimator,
-                    (bus.topic(names.sensor, ForceSample), frames),
-                    publish,
-                    keep_samples=self._keep_samples,
-                )
-            )
-            self._on_host(host_name(1 if model is None else 2), hosts[-1].inbox)
+    def begin(self) -> None:
+        """What follows belongs to the indentation."""
+        self._host = EstimatorHost(
+            self._clock, self._estimator, self._inputs, self._publish, keep_samples=self._keep_samples
+        )
+        self._on_host(self._host_name, self._host.inbox)
 
-        rests = None
-        try:
-            rests = source.indent(begin, progress)
-        finally:
-            for host in hosts:
-                host.close()
-            for sample in estimator.finish():
-                publish(sample)
-            watch.cancel()
-            matched = [s for s in found if isinstance(s, IndentationSample)]
-            drift = drift_of(seen, matched, rests)
-            indentation = Indentation(
-                samples=matched,
-                unmatched=estimator.matcher.unmatched,
-                frames=without_drift(all_frames(matched, seen, estimator.matcher.given_up), drift),
-                drift=drift,
-                deformations=seen,
-                estimates=[s for s in found if isinstance(s, SpecimenEstimate)],
-                forces=[s for s in found if isinstance(s, VisionForceSample)],
-                arrivals=[order for host in hosts for order in host.inbox.arrivals],
-                recorded=[sample for host in hosts for sample in host.recorded],
-            )
-            if model is None:
-                self.first = indentation
-            else:
-                self.check = indentation
+    def end(self, rests: Rests | None) -> Indentation:
+        """No more samples come; `rests` are the tool's, if they are known."""
+        if self._host is not None:
+            self._host.close()
+        for sample in self._estimator.finish():
+            self._publish(sample)
+        self._watch.cancel()
+        matched = [sample for sample in self._found if isinstance(sample, IndentationSample)]
+        matcher, drift = self._estimator.matcher, drift_of(self._seen, matched, rests)
+        return Indentation(
+            samples=matched,
+            unmatched=matcher.unmatched,
+            frames=without_drift(all_frames(matched, self._seen, matcher.given_up), drift),
+            drift=drift,
+            deformations=self._seen,
+            estimates=[sample for sample in self._found if isinstance(sample, SpecimenEstimate)],
+            forces=[sample for sample in self._found if isinstance(sample, VisionForceSample)],
+            arrivals=[] if self._host is None else self._host.inbox.arrivals,
+            recorded=[] if self._host is None else self._host.recorded,
+        )
+
+    def _publish(self, sample: Sample) -> None:
+        self._found.append(sample)
+        self._topics[type(sample)].publish(sample)
 
 
 def after_slip(identification: Identification) -> SpecimenModel:

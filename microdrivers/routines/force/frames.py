@@ -19,7 +19,7 @@ from microdrivers.routines.force.source import Rests
 TOUCHES_UN = 1.0
 """A change of the force by which a tool must touch: its own spring is bent then."""
 
-_CLEAR = 8.0
+_FELT_SIGMAS = 8.0
 """Standard deviations that are no noise."""
 
 
@@ -83,7 +83,7 @@ def in_contact_uN(frames: Iterable[IndentationSample]) -> list[float]:
     if not len(known):
         return []
     off = np.abs(known - np.median(known))
-    found: list[float] = off[off > max(TOUCHES_UN, _CLEAR * float(np.median(off)) / 0.6745)].tolist()
+    found: list[float] = off[off > max(TOUCHES_UN, _FELT_SIGMAS * float(np.median(off)) / 0.6745)].tolist()
     return found
 
 

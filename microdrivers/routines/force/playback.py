@@ -16,6 +16,7 @@ class IndentationPlayback:
     """Publishes a recorded indentation, once."""
 
     past_run = PastRun()
+    past_settings = None
     whereabouts = ""
 
     def __init__(self, table: IndentationTable) -> None:

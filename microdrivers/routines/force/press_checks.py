@@ -37,7 +37,7 @@ def check_press(
             f"the probe at {settings.speed_um_s:g} µm/s would be faster than {whose}: "
             f"{min(axes_um_s, guard_um_s):.4g} µm/s on this way",
             device=stage.name,
-            remedy="press slower: --speed-um-s; or change the rig file",
+            remedy="press more slowly: --speed-um-s; or change the rig file",
         )
     if start_um is None:
         return
@@ -49,7 +49,7 @@ def check_press(
             f"{settings.depth_um:g} µm are to be pressed, and back for {behind_um:.0f} µm, of which "
             f"{settings.free_travel_um:g} µm are needed",
             device=stage.name,
-            remedy="choose a place nearer to the middle of the travel (ready_um in the rig file), or press less deep",
+            remedy="choose a place nearer to the middle of the travel (ready_um in the rig file), or press less deeply",
         )
     if all(stage.referenced.values()):
         try:

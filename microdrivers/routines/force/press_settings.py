@@ -8,24 +8,28 @@ from typing import NamedTuple
 from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import Range, check_range
 
-SPEEDS_UM_S = Range(0.1, 100.0)
-DEPTHS_UM = Range(5.0, 1000.0)
-HOLDS_S = Range(0.0, 3600.0)
+SPEEDS_UM_S, DEPTHS_UM, HOLDS_S = Range(0.1, 100.0), Range(5.0, 1000.0), Range(0.0, 3600.0)
+"""What may be asked of a press, whatever the rig."""
 
 _SHARE_OF_LIMIT = 0.8
-"""Of the guard's limit, or of the sensor's range."""
+"""Of the largest push that guard and sensor allow."""
 
 
 class PressSettings(NamedTuple):
-    """The experiment's figures; the speed is the paper's.
+    """The experiment's figures; the speed is the paper's. All are finite and none is negative.
 
     Attributes:
-        depth_um: how far to press beyond the contact. max_force_uN: where pressing ends before that; None: 80 % of the
-            guard's limit or, without a guard, of the sensor's range.
-        hold_s: how long to stay at the deepest point.
-        free_travel_um: how far the probe travels in sight, touching nothing, to measure the scale; in `free_steps`.
+        speed_um_s: of the tip on the approach, in and out, 0.1 to 100.
+        depth_um: how far to press beyond the contact, 5 to 1000.
+        max_force_uN: where pressing ends before that, above 0 and below what guard and sensor allow; None: 80 % of it.
+        hold_s: how long to stay at the deepest point, up to 3600.
+        tare_s: how long a tare takes, 0.05 to 60.
+        free_travel_um: how far the probe travels in sight, touching nothing, to measure the scale.
+        free_steps: frames are taken at the ends of so many steps of that travel.
+        free_speed_um_s: of the stage through free space; a guard or the axes may allow less.
         most_approach_um: how far to look for the specimen beyond the starting point.
-        back_off_um: how far before the contact an indentation begins. rest_s: how long the specimen may recover.
+        back_off_um: how far before the contact an indentation begins.
+        rest_s: how long the specimen may recover from the contact.
     """
 
     speed_um_s: float = 5.0
@@ -59,24 +63,32 @@ class PressSettings(NamedTuple):
         """How far to look for the specimen where the way is so long: the depth must still fit in."""
         return min(self.most_approach_um, longest_um - self.depth_um)
 
-    def limit_uN(self, range_uN: Range, *, guard_uN: float | None) -> float:
-        """The force at which pressing ends by itself, before a guard must act.
+    def limit_uN(self, range_uN: Range, *, guard_uN: float | None, tare_uN: float = 0.0) -> float:
+        """The tared force at which pressing ends by itself, before a guard must act or the sensor is saturated.
 
         Args:
-            range_uN: of the sensor.
-            guard_uN: limit of its guard; None if it has none.
+            range_uN: of the sensor, without a tare; a push reads positive.
+            guard_uN: tared limit of its guard; None if it has none.
+            tare_uN: the sensor's zero.
 
         Raises:
-            OutOfRange: more is asked for than sensor or guard allow.
+            OutOfRange: more is asked for than sensor or guard allow, or they allow nothing.
         """
-        ceiling = min(abs(range_uN.min), abs(range_uN.max), math.inf if guard_uN is None else guard_uN)
+        whose, ceiling_uN = "the sensor's range", range_uN.max - tare_uN
+        if guard_uN is not None and guard_uN <= ceiling_uN:
+            whose, ceiling_uN = "the guard's limit", guard_uN
+        whose += f" at a zero of {tare_uN:.4g} µN" if tare_uN else ""
+        if ceiling_uN <= 0.0:
+            raise OutOfRange(
+                f"{whose} leaves no force to press with: a push reads positive, and may be {ceiling_uN:.4g} µN at most",
+                remedy="correct range_uN and axis of the sensor in the rig file, or the amplifier's zero",
+            )
         asked = self.max_force_uN
         if asked is None:
-            return _SHARE_OF_LIMIT * ceiling
-        if not 0.0 < asked < ceiling:
-            what = "the guard's limit" if ceiling == guard_uN else "the sensor's range"
+            return _SHARE_OF_LIMIT * ceiling_uN
+        if not 0.0 < asked < ceiling_uN:
             raise OutOfRange(
-                f"a largest force of {asked:g} µN is not between 0 and {what}, {ceiling:g} µN",
+                f"a largest force of {asked:g} µN is not between 0 and {whose}, {ceiling_uN:.4g} µN",
                 remedy="press less, or change the safety section of the rig file",
             )
         return asked

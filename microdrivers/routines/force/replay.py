@@ -9,6 +9,7 @@ from microdrivers.core.clock import Clock, SimulatedClock
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.core.samples import ForceSample, Frame
+from microdrivers.estimators.force.identify import IdentificationSettings
 from microdrivers.estimators.vision.contact import ImageScale
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
@@ -18,6 +19,7 @@ from microdrivers.routines.force.source import (
     DONE,
     END,
     READY,
+    SETTINGS,
     FrameTracker,
     IndentationNames,
     IndentationSetup,
@@ -49,6 +51,7 @@ class IndentationReplay:
                 remedy="give the run.mcap of `calibrate force`; `microdrivers info` tells what a file holds",
             )
         self._ready = ready[-1]
+        self._settings = [note for note in notes if note.kind == SETTINGS and note.order < self._ready.order]
         self._begins = [note for note in notes if note.kind == BEGIN and note.order > self._ready.order]
         self._ends = [note for note in notes if note.kind == END and note.order > self._ready.order]
         self._done = [note for note in notes if note.kind == DONE and note.order > self._ready.order]
@@ -117,6 +120,14 @@ class IndentationReplay:
         begun = [note.order for note in self._begins[number - 1 : number + 1]]
         own = [note for note in self._ends if begun and begun[0] < note.order and not note.order > begun[-1] > begun[0]]
         return own[0] if own else None
+
+    @property
+    def past_settings(self) -> IdentificationSettings | None:
+        """As they were; a setting that is not known any more is left out."""
+        if not self._settings:
+            return None
+        noted = self._settings[-1].content
+        return IdentificationSettings(**{name: noted[name] for name in IdentificationSettings._fields if name in noted})
 
     @property
     def past_run(self) -> PastRun:

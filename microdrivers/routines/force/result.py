@@ -12,7 +12,7 @@ from microdrivers.core.contact_samples import IndentationSample, VisionForceSamp
 from microdrivers.core.errors import MicrodriversError
 from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.force_sensor import SATURATED
-from microdrivers.estimators.force.motion_limit import largest_speed_um_s
+from microdrivers.estimators.force.motion_limit import speed_limit
 from microdrivers.estimators.force.protocol_fit import ProtocolFit
 from microdrivers.estimators.force.record import IndentationRecord, saturated
 from microdrivers.estimators.force.vision_force import MAY_BE_RELEASED, OUTSIDE_RANGE
@@ -167,11 +167,11 @@ def _slip(run: ForceRun) -> SlipFit | None:
 
 
 def _speed_limit(best: ProtocolFit, force_uN: float) -> float | None:
-    """What keeps the predicted force at the deepest point below the largest that was measured, if the model holds."""
+    """What keeps the predicted force below the largest measured, down to the deepest point, if the model holds."""
     if not (best.identifiable["k1"] and best.identifiable["b"]):
         return None
     try:
-        return _known(largest_speed_um_s(best.model(), max_force_uN=force_uN, depth_um=best.deepest_um))
+        return _known(speed_limit(best.model(), max_force_uN=force_uN, depth_um=best.deepest_um).speed_um_s)
     except MicrodriversError:  # the model says nothing about speeds here
         return None
 
@@ -274,12 +274,13 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
         )
     if check is None and run.check is not None:
         notes.append(
-            "The fresh indentation had hardly begun to press when it ended: it tells nothing of force from the camera."
+            "The check indentation ended before the probe had pressed noticeably; camera-based force could not be "
+            "assessed."
         )
     if check is not None and check.left_over_uN is not None:
         notes.append(
-            f"The camera told up to {check.left_over_uN:.3g} µN after the tip had left in the fresh indentation: the "
-            "specimen lies farther in than this model has it. Such frames are flagged MAY_BE_RELEASED."
+            f"The camera still indicated up to {check.left_over_uN:.3g} µN after contact was lost in the check "
+            "indentation; the surface now lies deeper than the model assumes. Such frames are flagged MAY_BE_RELEASED."
         )
     best = protocols[run.identification.best]
     if best.misfit.found:

@@ -21,8 +21,10 @@ from microdrivers.results.optics import OpticsResult, read_result
 from microdrivers.rig import Rig
 
 _SAME_ZOOM = 2e-3
-_SCALE_SLACK = 5e-3
-_SIGMAS = 4.0
+"""Relative difference of two readings of the zoom within which a calibration holds."""
+
+_SCALE_SLACK, _SIGMAS = 5e-3, 4.0
+"""So far may the probe's travel contradict a calibration: this part of it, and so many standard deviations of both."""
 
 TRAVEL = "the probe's own travel"
 
@@ -54,7 +56,7 @@ class Sight:
         if section is None:
             return cls()
         camera = rig.device(section.camera, Camera)
-        _require_same(result, camera, _zoom(rig), file)
+        _require_same(result, camera, rig, file)
         axis: FloatArray = np.array(rig.device(section.force, ForceSensor).axis, dtype=np.float64)
         if math.hypot(axis[0], axis[1]) < math.sqrt(0.5):
             raise IllConditioned(
@@ -131,17 +133,20 @@ class Sight:
         return self._projection or ImageScale.from_travel(tip)
 
 
-def _zoom(rig: Rig) -> float | None:
+def zoom_of(rig: Rig) -> float | None:
+    """What the microscope's zoom reads; None if the rig has none, or it cannot be asked."""
     microscope = rig.file.microscope
     motor = rig.devices.get(microscope.zoom) if microscope is not None else None
-    return motor.read().zoom if isinstance(motor, ZoomMotor) else None
+    return motor.read().zoom if isinstance(motor, ZoomMotor) and motor.link == "open" else None
 
 
-def _require_same(result: OpticsResult, camera: Camera, zoom: float | None, file: Path) -> None:
-    valid, now = result.valid_for, camera.settings
+def _require_same(result: OpticsResult, camera: Camera, rig: Rig, file: Path) -> None:
+    valid, now, zoom, microscope = result.valid_for, camera.settings, zoom_of(rig), rig.file.microscope
     differences = []
     if valid.camera != camera.name:
         differences.append(f"of camera {valid.camera}, not {camera.name}")
+    if zoom is None and microscope is not None and microscope.zoom in rig.devices:
+        differences.append(f"at zoom {valid.zoom:.4g}, and {microscope.zoom} cannot be asked for its own")
     if zoom is not None and not math.isclose(valid.zoom, zoom, rel_tol=_SAME_ZOOM):
         differences.append(f"at zoom {valid.zoom:.4g}, and the zoom reads {zoom:.4g}")
     if (valid.binning, tuple(valid.roi)) != (now.binning, tuple(now.roi)):
@@ -149,7 +154,7 @@ def _require_same(result: OpticsResult, camera: Camera, zoom: float | None, file
     if differences:
         raise StaleCalibration(
             f"the calibration {file} is {'; '.join(differences)}",
-            remedy="calibrate the optics as they are now, or leave the calibration out: the probe's travel tells the "
+            remedy="calibrate the optics as they are now, or leave the calibration out: the probe's travel gives the "
             "scale",
         )
 

@@ -9,11 +9,15 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.samples import Frame
+from microdrivers.estimators.force.identify import IdentificationSettings
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 READY, BEGIN, END, DONE = "force/ready", "force/begin", "force/end", "force/done"
 """The routine's notes: all is ready for indentations, one begins, it has ended; the run is over, early by what."""
+
+SETTINGS = "force/settings"
+"""The routine's note of how specimens are identified."""
 
 
 def host_name(number: int) -> str:
@@ -90,6 +94,10 @@ class IndentationSource(Protocol):
     @property
     def past_run(self) -> PastRun:
         """What a recording tells of its run, valid after `indent`."""
+
+    @property
+    def past_settings(self) -> IdentificationSettings | None:
+        """How a recorded run identified; None for a live run, or where a recording does not tell."""
 
     def prepare(self, progress: Progress) -> FrameTracker | None:
         """Make everything ready for an indentation; returns what finds the deformation in frames."""

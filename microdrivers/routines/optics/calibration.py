@@ -22,9 +22,9 @@ from microdrivers.results.optics import (
     iterations_to_settle,
 )
 from microdrivers.results.record import Provenance, Trace
-from microdrivers.routines.notes import noted_ending
+from microdrivers.routines.notes import note, noted_ending
 from microdrivers.routines.optics.choice import Choice, begins_change, choose_estimate
-from microdrivers.routines.optics.source import DONE, HOST, Optics, OpticsSource
+from microdrivers.routines.optics.source import DONE, HOST, SETTINGS, Optics, OpticsSource
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
@@ -64,14 +64,19 @@ def calibrate_optics(
 ) -> OpticsRun:
     """Let a source publish and estimate P from what it publishes, on line.
 
-    `on_host` is told the estimator's inbox once it is there, for who records the order of arrival.
+    Args:
+        source: what to calibrate with.
+        settings: of the estimator; None: those of the recorded run, or the usual ones.
+        progress: where to report.
+        keep_samples: keep what the estimator got in `recorded`.
+        on_host: is told the estimator's inbox once it is there, for who records the order of arrival.
 
     An interruption (Ctrl-C) ends the source, which stops what moves, and keeps what was measured.
 
     Raises:
         MicrodriversError: whatever the source raises.
     """
-    settings = settings or CalibratorSettings()
+    settings = settings or source.past_settings or CalibratorSettings()
     bus, names = source.bus, source.names
     stage, zoom = bus.topic(names.stage, XYThetaSample), bus.topic(names.zoom, ZoomSample)
     track = bus.topic(f"{names.camera}/track", TrackedPoint)
@@ -111,6 +116,7 @@ def calibrate_optics(
             host.close()
         subscription.cancel()
 
+    note(bus, source.clock, SETTINGS, settings._asdict())
     with noted_ending(bus, source.clock, DONE, finish=finish) as ending:
         source.run(begin, progress or SilentProgress())
     ended_by = ending.ended_by

@@ -95,6 +95,7 @@ class CircleExperiment:
     """Finds the target, centres it, streams the stage along a circle and changes the zoom on the way."""
 
     past_run = PastRun()
+    past_settings = None
 
     def __init__(self, rig: Rig, settings: CircleSettings | None = None) -> None:
         section = rig.file.microscope

@@ -25,6 +25,7 @@ class SequencePlayback:
     """
 
     past_run = PastRun()
+    past_settings = None
 
     def __init__(self, sequence: ImageSequence, *, target: TargetKind = "texture", frames: int | None = None) -> None:
         self.bus = Bus()

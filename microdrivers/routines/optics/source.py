@@ -8,12 +8,15 @@ from typing import NamedTuple, Protocol
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import Clock
 from microdrivers.core.errors import ConfigError
-from microdrivers.estimators.optics.calibrator import PointTracker
+from microdrivers.estimators.optics.calibrator import CalibratorSettings, PointTracker
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress
 
 BEGIN = "optics/begin"
 """The routine's note that what follows belongs to the calibration."""
+
+SETTINGS = "optics/settings"
+"""The routine's note of what its estimator is set to."""
 
 DONE = "optics/done"
 """The routine's note that the run is over, and by what it was ended early."""
@@ -61,6 +64,10 @@ class OpticsSource(Protocol):
     @property
     def past_run(self) -> PastRun:
         """What a recording tells of its run, valid after `run`."""
+
+    @property
+    def past_settings(self) -> CalibratorSettings | None:
+        """What the estimator of a recorded run was set to; None for a live run, or where a recording does not tell."""
 
     def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
         """Publish the samples.

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from microdrivers.estimators.force.line_fit import Point, broken_line_gains, fit, shape_gain
-from microdrivers.estimators.force.local_motion import LocalMotion, Motion, MotionSettings
+from microdrivers.estimators.force.local_motion import InstantMotion, LocalMotion, MotionSettings
 
 Array = npt.NDArray[np.float64]
 
@@ -20,7 +20,7 @@ RATE_HZ = 30.0
 SHORT = MotionSettings(lag=5, window=20)
 
 
-def told(motion: LocalMotion, t_s: Array, x_um: Array, *, sigma_um: float = 0.06) -> list[Motion]:
+def told(motion: LocalMotion, t_s: Array, x_um: Array, *, sigma_um: float = 0.06) -> list[InstantMotion]:
     found = []
     for t, x in zip(t_s.tolist(), x_um.tolist(), strict=True):
         found += motion.update(round(1e9 * t), x, sigma_um)

@@ -12,6 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from microdrivers.core.contact_samples import DeformationSample, VisionForceSample
+from microdrivers.estimators.force.indenter import IndentationEstimator
+from microdrivers.estimators.force.matcher import IndentationMatcher
 from microdrivers.estimators.force.model import SpecimenModel
 from microdrivers.estimators.force.vision_force import VisionForce, VisionForceSettings
 
@@ -244,6 +246,19 @@ def test_lost_frames_are_said_at_once_in_order_and_recovered_from() -> None:
     assert times == sorted(times)
     errors = [f.force_uN - record.force_uN[301 + k] for k, f in enumerate(after)]
     assert max(map(abs, errors[:100])) < 30.0
+
+
+def test_an_indentation_that_ends_while_pressed_gives_a_force_for_every_frame() -> None:
+    record = indentation(PRESETS["single"])
+    samples = frames(record)[:400]
+    estimator = IndentationEstimator(None, IndentationMatcher(), vision_force=VisionForce(PRESETS["single"]))
+    found = [force for sample in samples for force in estimator.update(sample)]
+    assert len(found) < len(samples)
+    found += estimator.finish()
+    assert [force.t_ns for force in found] == [sample.t_ns for sample in samples]
+    last = [force.force_uN for force in found[-5:] if isinstance(force, VisionForceSample)]
+    assert last == pytest.approx(record.force_uN[395:400].tolist(), rel=0.05)
+    assert estimator.finish() == []
 
 
 def test_beyond_the_characterised_range_is_said() -> None:

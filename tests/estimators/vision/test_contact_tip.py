@@ -43,7 +43,7 @@ def test_the_tip_is_found_whatever_its_direction(
     assert tip.scale_px_per_um == pytest.approx(scale, abs=5.0 * tip.scale_sigma_px_per_um)
     assert tip.scale_sigma_px_per_um < 2e-3 * scale
     across = float(scene.direction @ (-tip.direction[1], tip.direction[0]))
-    assert abs(across) < 5.0 * tip.direction_sigma_rad < 0.02
+    assert abs(across) < 0.005
     error = tip.front_px - (110.0 - 60.0 * scale * scene.direction)
     assert np.hypot(*error) < 0.9
     assert tip.width_px == pytest.approx(60.0 * scale, abs=2.5)

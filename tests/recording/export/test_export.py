@@ -179,7 +179,7 @@ def test_sixteen_bits_become_the_upper_eight(recorded):
 def test_nothing_is_written_over_and_nothing_half_done_stays(exported, tmp_path, monkeypatch):
     exported("csv", topics=["camera"])
     before = (tmp_path / "out" / "camera.csv").read_bytes()
-    with pytest.raises(ConfigError, match="never writes over"):
+    with pytest.raises(ConfigError, match="never overwrites"):
         exported("csv")
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["camera.csv"]
     assert (tmp_path / "out" / "camera.csv").read_bytes() == before

@@ -146,7 +146,7 @@ def test_parquet_holds_the_same(in_process, files, tmp_path):
 
 
 def test_tables_are_refused(in_process, files, tmp_path):
-    for name, told in (("a.txt", "end in .csv"), ("there.csv", "never written over"), ("dir/", "must end in")):
+    for name, told in (("a.txt", "end in .csv"), ("there.csv", "never overwritten"), ("dir/", "must end in")):
         (tmp_path / "there.csv").write_text("mine")
         with pytest.raises(ConfigError, match=told):
             analyse_recordings(files, tmp_path / name, analyse=fake_row)
