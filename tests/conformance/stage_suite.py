@@ -63,12 +63,16 @@ def stamps_the_instant_of_the_pose(bench: StageBench) -> None:
     """In motion at 1 mm/s, the pose is that of its stamp within noise and the stated (95 %) uncertainty of time."""
     samples: list[XYThetaSample] = []
     bench.stage.topic.subscribe(samples.append)
-    move = bench.stage.start_move_to(**_near(bench, x_um=700.0), speed_um_s=1000.0)
+    move = bench.stage.start_move_to(**_near(bench, x_um=4000.0), speed_um_s=1000.0)
+    wanted, before_ns = 0.3 * bench.pose_rate_hz, bench.clock.now_ns() + round(3.5 * NS_PER_S)
     with bench.stage.stream(bench.pose_rate_hz):
-        bench.clock.sleep(0.5)
-    move.wait()
+        while sum(sample.moving for sample in samples) <= wanted and bench.clock.now_ns() < before_ns:
+            bench.clock.sleep(0.1)
+    bench.stage.stop()
+    with pytest.raises(MoveCancelled):
+        move.wait()
     moving = [sample for sample in samples if sample.moving]
-    assert len(moving) > 0.3 * bench.pose_rate_hz
+    assert len(moving) > wanted
     within = [
         abs(sample.x_um - bench.truth("x", sample.t_ns)) <= bench.noise_um + 1000.0 * 1.5e-9 * sample.dt_ns
         for sample in moving
