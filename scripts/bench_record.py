@@ -200,7 +200,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
         folder = Path(name)
         moment = random.Random(1)
-        for frames in (False, True):
+        for frames in (False, True) if arguments.kills else ():
             kills = [kill_once(folder, frames=frames, moment=moment) for _ in range(arguments.kills)]
             lost_s = max(lost for lost, _, _ in kills)
             what = f"{len(kills)} × SIGKILL, {'with' if frames else 'without'} frames"

@@ -64,7 +64,7 @@ def optics_recording(tmp_path_factory):
     from microdrivers.recording.image_sequence import ImageSequence
     from microdrivers.recording.recorder import Recorder
     from microdrivers.routines.notes import note
-    from microdrivers.routines.optics.source import BEGIN
+    from microdrivers.routines.optics.source import BEGIN, DONE
 
     bus, clock = Bus(), SimulatedClock()
     known = {
@@ -80,6 +80,7 @@ def optics_recording(tmp_path_factory):
         bus.topic("camera", Frame).subscribe(lambda frame: frame.seq or note(bus, clock, BEGIN, known))
         sequence = ImageSequence(Path(__file__).parent / "data" / "micrograph_sequence")
         sequence.publish(bus, stage="stage", zoom="zoom", camera="camera")
+        note(bus, clock, DONE, {"ended_by": ""})
     return folder / "run.mcap"
 
 
@@ -91,7 +92,7 @@ def force_recording(tmp_path_factory):
     from microdrivers.recording.indentation_table import IndentationTable
     from microdrivers.recording.recorder import Recorder
     from microdrivers.routines.force import IndentationPlayback
-    from microdrivers.routines.force.source import BEGIN, END, READY, SETTINGS
+    from microdrivers.routines.force.source import BEGIN, DONE, END, READY, SETTINGS
     from microdrivers.routines.notes import note
     from microdrivers.routines.progress import SilentProgress
 
@@ -106,4 +107,5 @@ def force_recording(tmp_path_factory):
         note(source.bus, clock, BEGIN, {})
         source.indent(lambda: None, SilentProgress())
         note(source.bus, clock, END, {})
+        note(source.bus, clock, DONE, {"ended_by": ""})
     return folder / "run.mcap"

@@ -8,6 +8,7 @@ import numpy as np
 
 from microdrivers.core.errors import NoContact
 from microdrivers.estimators.force.departure import Departure, find_departure
+from microdrivers.estimators.force.drift import CLEAR_SLOPE, straight_drift
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.record import CLEAR, medians_of_five
 
@@ -30,9 +31,6 @@ _SHORTEST_HOLD = 8
 _SHORTEST_LOSS = 3
 _STARTS_IN_CONTACT = 0.05
 """Growth of the force before the contact, relative to that while loading, which is more than a sensor's drift."""
-
-CLEAR_SLOPE = 4.0
-"""Standard deviations of a slope that are no noise."""
 
 
 class Branches(NamedTuple):
@@ -72,6 +70,7 @@ def find_branches(
 
     The contact is where the force leaves its baseline, the reversals are where straight lines through the deformation
     on either side meet, and contact is lost where the force returns to the baseline for good, be it before a reversal.
+    A drift that both ends of the record agree on is taken off first.
 
     Args:
         time_s: increasing.
@@ -84,6 +83,8 @@ def find_branches(
         NoContact: the force does not rise.
     """
     n = len(time_s)
+    drift = straight_drift(time_s, force_uN, force_sigma_uN)
+    force_uN = force_uN if drift is None else force_uN - drift.at(time_s)
     peak = int(np.argmax(medians_of_five(np.pad(deformation_um, 2, mode="edge"))))
     onset = _onset(time_s, force_uN, force_sigma_uN)
     first = onset.early

@@ -42,20 +42,24 @@ def find_departure(force_uN: Array, sigma_uN: float) -> Departure | None:
     force = np.array(force_uN, dtype=np.float64)
     for _ in range(_DRIFTS):
         found = _rise(force, sigma_uN, _BASELINE)
-        if found is not None and _is_steep(force, found[0], sigma_uN):
-            first, base = found
-            # The sample before may have felt a part of its exposure: it belongs to the contact then.
-            first -= int(force[first - 1] > base + CLEAR * sigma_uN)
-            return Departure(first, first)
         # A force that rises slowly drags a short baseline along.
         longer = [_rise(force, sigma_uN, length) for length in _LONGER if length < len(force)]
         noticed = [first for first, _ in filter(None, [found, *longer])]
         if not noticed:
             return None
+        steep = found if found is not None and _is_steep(force, found[0], sigma_uN) else None
         seen = _until_clear(force, sigma_uN, min(noticed))
-        likely = _most_likely(force[seen], sigma_uN)
+        if steep is not None:
+            # What has risen slowly until then is no baseline: it turns steep at the reversal, too.
+            seen = slice(seen.start, min(seen.stop, steep[0] - 1))
+        likely = _most_likely(force[seen], sigma_uN) if min(noticed) < seen.stop else None
         if likely is not None:
             return Departure(seen.start + likely.early, seen.start + likely.late)
+        if steep is not None:
+            first, base = steep
+            # The sample before may have felt a part of its exposure: it belongs to the contact then.
+            first -= int(force[first - 1] > base + CLEAR * sigma_uN)
+            return Departure(first, first)
         # A drift: what leaves its line comes later.
         force -= np.polynomial.Polynomial.fit(np.arange(seen.start, seen.stop), force[seen], 1)(np.arange(len(force)))
     return None

@@ -28,7 +28,13 @@ from microdrivers.estimators.force.joint import (
 )
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.prepared import LOADING, Indices, Prepared
-from microdrivers.estimators.force.protocols import DAMPER_OF_LOADING, SPRINGS_OF_UNLOADING, Fit, Protocol
+from microdrivers.estimators.force.protocols import (
+    DAMPED_SLIP,
+    DAMPER_OF_LOADING,
+    SPRINGS_OF_UNLOADING,
+    Fit,
+    Protocol,
+)
 from microdrivers.estimators.force.ridge import ridge_fit
 from microdrivers.estimators.force.trajectory import Trajectory
 
@@ -68,7 +74,8 @@ def fit_protocol(
     else:
         problem, solution, extra = _with_discrepancy(problem, prepared, protocol)
         within = extra == 0.0
-    return _fit(problem, solution, _covariance(solution, problem, within), extra, within, at, spacing_s)
+    covariance = _covariance(solution, problem, within) + _by_drift(prepared, solution, problem)
+    return _fit(problem, solution, covariance, extra, within, at, spacing_s)
 
 
 def _with_discrepancy(problem: Problem, prepared: Prepared, protocol: Protocol) -> tuple[Problem, Solution, float]:
@@ -116,6 +123,21 @@ def fit_unloading_springs(prepared: Prepared, pooled: Fit, spacing_s: float) -> 
     return _fit(problem, solution, covariance, discrepancy, False, at, spacing_s)
 
 
+def damping_on_the_way_back(prepared: Prepared, slipped: Fit, *, far_likelier: float) -> float:
+    """The damper of the unloading with which noise explains a slip by so much better than without; 0 if with none.
+
+    Args:
+        prepared: the samples.
+        slipped: `slip_corrected`, which has none.
+        far_likelier: difference of −2·log-likelihood, beyond the price of the parameter.
+    """
+    if not slipped.within_noise:
+        return 0.0
+    damped = fit_protocol(prepared, DAMPED_SLIP, slipped.spacing_s, only_noise_from=slipped.theta)
+    gain = slipped.solution.cost - damped.solution.cost - np.log(2 * damped.solution.samples)
+    return float(damped.theta[B_UNLOADING]) if damped.within_noise and gain > far_likelier else 0.0
+
+
 def _fit(
     problem: Problem,
     solution: Solution,
@@ -156,7 +178,7 @@ def _problem(prepared: Prepared, protocol: Protocol, at: Indices, family: Trajec
     seen = prepared.contact.seen != "nothing"
     if seen:
         groups.append(CONTACT_S)
-    if prepared.baseline_sigma_uN > 0.0:
+    if prepared.baseline is not None:
         groups.append(BASE)
     fixed = np.zeros(PARAMETERS)
     if not seen:
@@ -233,6 +255,17 @@ def _covariance(solution: Solution, problem: Problem, within_noise: bool) -> Arr
         free = free_covariance(problem, solution, lags=round(np.sqrt(solution.samples)))
     covariance: Array = problem.ties @ free[:p, :p] @ problem.ties.T
     return covariance
+
+
+def _by_drift(prepared: Prepared, solution: Solution, problem: Problem) -> Array:
+    """Covariance that follows from the slope of the baseline, which was taken off as if it were known for sure."""
+    baseline = prepared.baseline
+    if baseline is None or baseline.sigma_slope_uN_s == 0.0:
+        return np.zeros((PARAMETERS, PARAMETERS))
+    off = (problem.time_s - baseline.middle_s) * baseline.sigma_slope_uN_s / problem.force_sigma_uN
+    answer = free_covariance(problem, solution) @ (force_columns(problem, solution).T @ off)
+    moved = problem.ties @ answer[: problem.ties.shape[1]]
+    return np.outer(moved, moved)
 
 
 def _with_damping(springs: Fit, solution: Solution, problem: Problem) -> Array:

@@ -13,12 +13,13 @@ import numpy as np
 
 from microdrivers.core.errors import IllConditioned
 from microdrivers.estimators.force.branches import Branches
+from microdrivers.estimators.force.fitting import damping_on_the_way_back
 from microdrivers.estimators.force.judgement import judge
 from microdrivers.estimators.force.model import Array
-from microdrivers.estimators.force.notes import notes_on
+from microdrivers.estimators.force.notes import notes_on, on_a_misfit
 from microdrivers.estimators.force.prepared import Indices, Prepared, SeenBefore
 from microdrivers.estimators.force.protocol_fit import ProtocolFit
-from microdrivers.estimators.force.protocols import PROTOCOLS, ProtocolName
+from microdrivers.estimators.force.protocols import PROTOCOLS, Fit, ProtocolName
 from microdrivers.estimators.force.record import IndentationRecord, check
 from microdrivers.estimators.force.selection import all_protocols, settled
 from microdrivers.estimators.force.structure import StructureTest
@@ -31,6 +32,9 @@ _APART = 3.0
 
 _SIMPLER = 1.1
 """Of the smallest error: what a protocol with fewer parameters may have and still be preferred."""
+
+_NEARLY = 0.75
+"""Of the tool's speed: what a slip that was faster is estimated at, for it has slowed down until a force is noticed."""
 
 _CLEARLY = 0.5
 """Of the smallest error without a slip: what one leaves that is not well determined and is preferred all the same."""
@@ -134,14 +138,18 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     fits = all_protocols(prepared, on_ramps)
     both_ways = "single" in fits
     protocols = {name: judge(prepared, name, fit, both_ways=both_ways) for name, fit in fits.items()}
-    protocols = _rivals_marked(protocols)
     best = _best(protocols)
+    protocols = _rivals_marked(protocols, best)
+    if best == "slip_corrected":
+        protocols[best] = _with_weak(protocols[best], _hidden_by_slip(prepared, fits[best], protocols[best]))
     slip = _slip(prepared, protocols, best)
     notes = notes_on(record, prepared, both_ways=both_ways)
     if settings.protocol not in {None, best}:
         notes.append(f"{settings.protocol} was asked for; {best} would be preferred")
         best = _asked_for(settings.protocol, protocols)
     chosen = protocols[best]
+    if chosen.misfit.found:
+        notes += on_a_misfit(prepared)
     end_s = prepared.branches.released_s or float(prepared.time_s[-1])
     return Identification(
         protocols=protocols,
@@ -159,22 +167,60 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     )
 
 
-def _rivals_marked(protocols: Mapping[ProtocolName, ProtocolFit]) -> dict[ProtocolName, ProtocolFit]:
-    """The protocols; what two that explain the record about as well do not agree on is not determined."""
-    within = [fit for fit in protocols.values() if fit.within_noise and PROTOCOLS[fit.name].explains_both_ways]
+def _rivals_marked(
+    protocols: Mapping[ProtocolName, ProtocolFit], best: ProtocolName
+) -> dict[ProtocolName, ProtocolFit]:
+    """The protocols; a number that is another for one that explains the record as well or better is not determined."""
     marked = dict(protocols)
-    for one, other in itertools.permutations(within, 2):
-        if abs(one.likelihood_cost - other.likelihood_cost) > _AS_LIKELY:
+    least = min((fit.likelihood_cost for fit in protocols.values() if _explains(fit)), default=math.inf)
+    for one, other in itertools.permutations(protocols.values(), 2):
+        likely = _explains(other) and other.likelihood_cost <= least + _AS_LIKELY
+        if not (likely if _explains(one) else other.name == best and _explains(other)):
             continue
-        weak = dict(marked[one.name].weak)
+        better = one.likelihood_cost - other.likelihood_cost > _AS_LIKELY
+        how = "both branches" if not _explains(one) else "the record better" if better else "the record as well"
+        weak = {}
         for name, (mine, my_sigma) in one.springs_and_damper.items():
             its, its_sigma = other.springs_and_damper[name]
-            if abs(mine - its) > _APART * math.hypot(my_sigma, its_sigma):
-                why = f"{other.name} explains the record as well with {its:.3g}"
-                weak[name] = f"{weak[name]}; {why}" if name in weak else why
-        identifiable = {name: name not in weak for name in one.identifiable}
-        marked[one.name] = dataclasses.replace(marked[one.name], weak=weak, identifiable=identifiable)
+            if _is_ruled_out(one, other) or abs(mine - its) > _APART * math.hypot(my_sigma, its_sigma):
+                weak[name] = f"{other.name} explains {how} with {its:.3g}"
+        marked[one.name] = _with_weak(marked[one.name], weak)
     return marked
+
+
+def _with_weak(fit: ProtocolFit, more: Mapping[str, str]) -> ProtocolFit:
+    """A fit with more reasons why parameters are not determined."""
+    weak = {**fit.weak, **{name: "; ".join(filter(None, (fit.weak.get(name), why))) for name, why in more.items()}}
+    return dataclasses.replace(fit, weak=weak, identifiable={name: name not in weak for name in fit.identifiable})
+
+
+def _hidden_by_slip(prepared: Prepared, fit: Fit, slipped: ProtocolFit) -> dict[str, str]:
+    """What a slip may pass for, where it is preferred."""
+    names = ["slip", "slip_rate", *slipped.springs_and_damper]
+    b_unloading = damping_on_the_way_back(prepared, fit, far_likelier=_AS_LIKELY)
+    if b_unloading:
+        why = f"a damper of {b_unloading:.2g} µN·s/µm on the way back, too, explains the record better"
+        return dict.fromkeys(names, why)
+    at_first_um_s = slipped.slip_um * slipped.slip_rate_per_s
+    if at_first_um_s <= _NEARLY * slipped.fastest_um_s:
+        return {}
+    why = (
+        f"at first it slips by {at_first_um_s:.2g} µm/s, hardly slower than the tool ({slipped.fastest_um_s:.2g} "
+        "µm/s): a slip that outruns the tool leaves no force, and that part is not in the record"
+    )
+    return {"slip": why, "b": why}
+
+
+def _is_ruled_out(one: ProtocolFit, other: ProtocolFit) -> bool:
+    """Whether noise explains what one leaves, but is far less likely to do so, the price of parameters aside."""
+    more = len(PROTOCOLS[one.name].groups) - len(PROTOCOLS[other.name].groups)
+    price = max(more, 0) * math.log(2 * len(one.force_uN))
+    return _explains(one) and one.likelihood_cost - other.likelihood_cost > _AS_LIKELY + price
+
+
+def _explains(fit: ProtocolFit) -> bool:
+    """Both branches, within noise."""
+    return fit.within_noise and PROTOCOLS[fit.name].explains_both_ways
 
 
 def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
@@ -183,7 +229,7 @@ def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
     names: list[ProtocolName] = ["single", "unloading_springs", "loading_only"]
     if _slip_counts(protocols["slip_corrected"], [protocols[name] for name in names]):
         names.append("slip_corrected")
-    within = [name for name in names if protocols[name].within_noise and PROTOCOLS[name].explains_both_ways]
+    within = [name for name in names if _explains(protocols[name])]
     if within:
         return min(within, key=lambda name: protocols[name].likelihood_cost)
     least = min(protocols[name].error_percent for name in names)
@@ -218,6 +264,7 @@ def _slip(prepared: Prepared, protocols: Mapping[ProtocolName, ProtocolFit], bes
     if fit.misfit.found:
         why.append("slip_corrected leaves more than noise")
     as_well = protocols[best].within_noise or protocols[best].error_percent <= _SIMPLER * fit.error_percent
+    as_well = as_well and not (_explains(fit) and _is_ruled_out(protocols[best], fit))
     if best != "slip_corrected" and as_well:
         why.append(f"{best} explains the record without a slip, as well or better")
     return Slip(

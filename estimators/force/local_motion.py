@@ -29,6 +29,10 @@ _LEAST_TURN = 0.4
 
 _SPIKE_SIGMAS = 5.0
 _ANCHOR_WEIGHT = 2
+_LATE_SIGMAS = 3.0
+_NEAR_CORNER = 0.25
+"""Of the time between two positions: so well is the instant of a corner known."""
+
 _REFINED = 8
 _LEAST_SIGMA_UM = 1e-3
 _FAR = 1_000_000
@@ -60,6 +64,8 @@ class InstantMotion(NamedTuple):
         sigma_um: standard deviation of one measured position.
         velocity_um_s, velocity_sigma_um_s: slope of the fit at that instant.
         velocity_age_s: how long before that instant lies the middle of the positions fitted; negative if after.
+        late_um_s: by how much the newer half of these positions is faster or slower, beyond what their noise explains.
+        corner_um_s: by how much the speed changes at a corner so near that it may lie on either side; 0 if none does.
         acceleration_um_s2: 0 unless it was asked for.
         begin_ns: beginning of the stretch without a corner that it belongs to.
         after_corner: whether that began with a corner rather than with the first position, a gap or a jump.
@@ -73,6 +79,8 @@ class InstantMotion(NamedTuple):
     velocity_um_s: float
     velocity_sigma_um_s: float
     velocity_age_s: float
+    late_um_s: float
+    corner_um_s: float
     acceleration_um_s2: float
     begin_ns: int
     after_corner: bool
@@ -87,6 +95,7 @@ class _Position(NamedTuple):
     sigma_um: float
     rank: int = 0
     spike: bool = False
+    corner_um_s: float = 0.0
 
 
 class LocalMotion:
@@ -144,7 +153,7 @@ class LocalMotion:
         motions = self._push(self._newest[-1], spike=False) if self._unscreened else []
         self._unscreened = False
         if self._pending:
-            motions += self._settle(len(self._pending), self._fit(self._points), self._count + _FAR)
+            motions += self._settle(len(self._pending), self._points, self._count + _FAR)
         return motions
 
     def _begin_anew(self) -> None:
@@ -172,36 +181,37 @@ class LocalMotion:
 
     def _push(self, position: _Position, *, spike: bool) -> list[InstantMotion]:
         motions: list[InstantMotion] = []
-        t_ns, t_s, x_um, sigma_um, _, _ = position
+        t_ns, t_s, x_um, sigma_um, _, _, _ = position
         self._pending.append(_Position(t_ns, t_s, x_um, sigma_um, self._count, spike))
         self._count += 1
         if not spike:
             self._points.append(Point(t_s, x_um))
         if not self._points:
             return motions
-        line = self._fit(self._points)
+        line, fitted = self._fit(self._points), [*self._points]
         least_um2 = _CORNER * sigma_um * sigma_um
         if line.left_um2 >= least_um2 and len(self._points) >= _BEFORE + self._beyond:
             at = self._suspect(line, least_um2)
             if at < len(self._points) - self._beyond:
                 motions = self._turn_near(line, at, least_um2)
-                line = self._fit(self._points)
+                fitted = [*self._points]
             elif at < len(self._points) and self._bends(at):
-                line = self._fit([*self._points][: at + 1])
-        self._speed_um_s = abs(line.slope)
+                fitted = fitted[: at + 1]
+        self._speed_um_s = abs(self._fit(fitted).slope)
         surplus = len(self._pending) - (self.settings.lag - 1)
         if surplus > 0:
-            motions += self._settle(surplus, line, self._count + _FAR)
+            motions += self._settle(surplus, fitted, self._count + _FAR)
         return motions
 
     def _fit(self, points: Sequence[Point]) -> LineFit:
         return fit(points, parabola=self.settings.with_acceleration)
 
-    def _settle(self, count: int, line: LineFit, corner_rank: int) -> list[InstantMotion]:
-        """Tell the oldest pending positions; the next corner lies right before the one with `corner_rank`."""
+    def _settle(self, count: int, points: Sequence[Point], corner_rank: int) -> list[InstantMotion]:
+        """Tell the oldest pending positions by these points; the next corner lies before the one with `corner_rank`."""
         motions = []
+        line, half = self._fit(points), fit([*points][-max(2, len(points) // 2) :])
         for _ in range(count):
-            t_ns, t_s, x_um, sigma_um, rank, spike = self._pending.popleft()
+            t_ns, t_s, x_um, sigma_um, rank, spike, corner_um_s = self._pending.popleft()
             clearance = corner_rank - 1 - rank
             motions.append(
                 InstantMotion(
@@ -211,6 +221,8 @@ class LocalMotion:
                     line.velocity_um_s(t_s),
                     sigma_um * line.velocity_spread_per_s(t_s),
                     t_s - line.middle_s,
+                    _beyond_noise_um_s(half, line, sigma_um),
+                    corner_um_s,
                     2.0 * line.bend,
                     self._begin_ns,
                     self._after_corner,
@@ -255,15 +267,28 @@ class LocalMotion:
         old = [point for point in self._points if point.t_s <= corner_s]
         new = [point for point in self._points if point.t_s > corner_s]
         line = self._fit(old)
-        past = sum(position.t_s <= corner_s for position in self._pending)
-        corner_rank = self._pending[past].rank
-        motions = self._settle(past, line, corner_rank)
         self._points.clear()
         if not jump:
             self._points.extend([Point(corner_s, line.position_um(corner_s))] * _ANCHOR_WEIGHT)
+            near_s = _NEAR_CORNER * (new[0].t_s - old[-1].t_s)
+            turn_um_s = abs(fit([*self._points, *new]).slope - line.slope)
+            self._pending = deque(
+                p._replace(corner_um_s=turn_um_s) if abs(p.t_s - corner_s) <= near_s else p for p in self._pending
+            )
         self._points.extend(new)
+        past = sum(position.t_s <= corner_s for position in self._pending)
+        corner_rank = self._pending[past].rank
+        motions = self._settle(past, old, corner_rank)
         self._pending = deque(p._replace(rank=p.rank - corner_rank) for p in self._pending)
         self._count -= corner_rank
         self._begin_ns = self._zero_ns + round((new[0].t_s if jump else corner_s) * NS_PER_S)
         self._after_corner = not jump
         return motions
+
+
+def _beyond_noise_um_s(part: LineFit, whole: LineFit, sigma_um: float) -> float:
+    """By how much the slope of a part of some positions differs from that of all, less what noise explains."""
+    if not part.norm1 > 0.0:
+        return 0.0
+    noise_um_s = _LATE_SIGMAS * sigma_um * math.sqrt(max(1.0 / part.norm1 - 1.0 / whole.norm1, 0.0))
+    return math.sqrt(max((part.slope - whole.slope) ** 2 - noise_um_s**2, 0.0))

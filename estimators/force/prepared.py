@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from microdrivers.core.errors import DataError, SaturatedData
-from microdrivers.estimators.force.branches import CLEAR_SLOPE, Branches, find_branches
+from microdrivers.estimators.force.branches import Branches, find_branches
+from microdrivers.estimators.force.drift import CLEAR_SLOPE, SHORTEST_BASELINE, Baseline, line_through
 from microdrivers.estimators.force.joint import BASE, CONTACT, CONTACT_S, PARAMETERS, Prior
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.record import IndentationRecord, Mask, lost, saturated, white_sigma
@@ -28,9 +29,6 @@ _MOSTLY = 0.5
 
 _NOISE_SCATTER = 5.0
 """Three relative standard deviations of an observed noise, times the root of the number of samples."""
-
-_SHORTEST_BASELINE = 15
-"""Samples out of contact at either end that a drift takes to be seen."""
 
 _LARGEST_SHARE = 0.2
 """Of a branch's samples: what may be left out at either end."""
@@ -98,7 +96,7 @@ class Prepared(NamedTuple):
         used: indices of the samples that fits may use, in order. branch: number of the branch of each.
         excluded: reason → indices of the other samples.
         contact: what is known of it before any fit.
-        baseline_uN: what was taken off. baseline_sigma_uN: its standard deviation; 0 where there was none to see.
+        baseline: what was taken off; None where there was none to see.
         frame_s: usual interval of samples.
         depth_um: range of the deformation.
     """
@@ -114,16 +112,20 @@ class Prepared(NamedTuple):
     branch: Indices
     excluded: dict[str, Indices]
     contact: ContactKnowledge
-    baseline_uN: Array
-    baseline_sigma_uN: float
+    baseline: Baseline | None
     frame_s: float
     depth_um: float
+
+    @property
+    def baseline_uN(self) -> Array:
+        """What was taken off the force of every sample."""
+        return np.zeros_like(self.time_s) if self.baseline is None else self.baseline.at(self.time_s)
 
     def priors(self) -> list[Prior]:
         """What is known of contact and baseline apart from the samples in contact."""
         row = np.zeros(PARAMETERS)
         row[BASE] = 1.0
-        base = [Prior(row, 0.0, self.baseline_sigma_uN)] if self.baseline_sigma_uN > 0.0 else []
+        base = [Prior(row, 0.0, self.baseline.sigma_level_uN)] if self.baseline is not None else []
         return self.contact.priors() + base
 
 
@@ -150,7 +152,7 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
     sigma_f = _stated_unless_exceeded(record.force_sigma_uN, force[measured])
     branches = find_branches(time_s, deformation, force, deformation_sigma_um=sigma_x, force_sigma_uN=sigma_f)
     frame_s = float(np.median(np.diff(time_s)))
-    base, base_sigma = _baseline(time_s, force, branches, measured, sigma_f, around_reversal)
+    baseline = _baseline(time_s, force, branches, measured, sigma_f, around_reversal)
     reasons = {
         "before contact": _mask(len(time_s), branches.approach),
         "after the tip had left": _mask(len(time_s), branches.lost),
@@ -164,7 +166,7 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
     return Prepared(
         time_s=time_s,
         deformation_um=deformation,
-        force_uN=force - base,
+        force_uN=force if baseline is None else force - baseline.at(time_s),
         measured=measured,
         deformation_sigma_um=sigma_x,
         force_sigma_uN=sigma_f,
@@ -173,8 +175,7 @@ def prepare(record: IndentationRecord, *, around_reversal: int, margins: Margins
         branch=branch,
         excluded=excluded,
         contact=_contact(time_s, deformation, force, branches, sigma_x, sigma_f, frame_s, around_reversal),
-        baseline_uN=base,
-        baseline_sigma_uN=base_sigma,
+        baseline=baseline,
         frame_s=frame_s,
         depth_um=float(np.ptp(deformation)),
     )
@@ -261,20 +262,19 @@ def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -
 
 def _baseline(
     time_s: Array, force: Array, branches: Branches, measured: Mask, sigma: float, around: int
-) -> tuple[Array, float]:
+) -> Baseline | None:
     """The force out of contact: a constant, or a line if there is enough of it at both ends and it drifts clearly."""
     before = _at_rest(range(branches.approach.start, branches.approach.stop - around), measured)
     after = _at_rest(range(branches.lost.start + around, branches.lost.stop), measured)
     rest = np.concatenate([before, after])
     if not len(rest):
-        return np.zeros_like(time_s), 0.0
-    level = float(np.mean(force[rest]))
-    if min(len(before), len(after)) >= _SHORTEST_BASELINE:
-        t = time_s[rest] - time_s[rest].mean()
-        slope, slope_sigma = float(t @ force[rest] / (t @ t)), sigma / float(np.sqrt(t @ t))
-        if abs(slope) > CLEAR_SLOPE * slope_sigma:
-            return level + slope * (time_s - time_s[rest].mean()), sigma / float(np.sqrt(len(rest)))
-    return np.full_like(time_s, level), sigma / float(np.sqrt(len(rest)))
+        return None
+    if min(len(before), len(after)) >= SHORTEST_BASELINE:
+        line = line_through(time_s[rest], force[rest], sigma)
+        if line.is_clear:
+            return line
+    level, sigma_level = float(np.mean(force[rest])), sigma / float(np.sqrt(len(rest)))
+    return Baseline(float(np.mean(time_s[rest])), level, sigma_level, 0.0, 0.0)
 
 
 def _at_rest(part: range, measured: Mask) -> Indices:

@@ -47,6 +47,9 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
 SPRINGS_OF_UNLOADING = Protocol((K1, K2), (UNLOADING,), (UNLOADING,))
 DAMPER_OF_LOADING = Protocol((B_LOADING,), (LOADING,), (LOADING,))
 
+DAMPED_SLIP = Protocol((K1, K2, B_LOADING, B_UNLOADING, SLIP, RATE), _ALL, _ALL)
+"""What `slip_corrected` leaves out: a damper on the way back. It is only asked whether it explains a record better."""
+
 
 class Fit(NamedTuple):
     """A protocol fitted.

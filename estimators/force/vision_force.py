@@ -54,7 +54,8 @@ class VisionForce:
     runs from the instant at which the deformation began. The mass is left out: a camera tells no acceleration.
 
     `sigma_uN` adds up the model's covariance and residual, the noise of the deformation and that of the velocity, and
-    the damper's force of such changes of speed as the velocity lags behind: as seen in the last two windows.
+    the damper's force of such changes of speed as the velocity lags behind: as large as any of the last two windows.
+    A change of speed shows after some frames; those told until then state it only if there was one like it before.
     A frame that is lost is published at once, and before it all that wait, by what was known until then.
 
     Flags: `LOST`, no deformation was seen; `NO_VELOCITY`, there is no velocity and so no force, both NaN;
@@ -126,7 +127,8 @@ class VisionForce:
         frame = self._waiting.popleft()
         x_um, v_um_s = self._compression(motion)
         seen_uN = self._seen_sigma_uN(motion, x_um, v_um_s)
-        hidden_uN = self._damper(v_um_s) * self._lag.hidden_um_s(motion)
+        damper = self._damper(v_um_s) if motion.corner_um_s == 0.0 else self._stronger_damper
+        hidden_uN = damper * self._lag.hidden_um_s(motion)
         if not math.isfinite(seen_uN):
             return self._publish(frame, math.nan, math.nan, math.nan, {NO_VELOCITY})
         noise_uN = math.hypot(seen_uN, hidden_uN, self.model.residual_uN)
@@ -178,6 +180,10 @@ class VisionForce:
     def _damper(self, v_um_s: float) -> float:
         return self.model.b_loading_uN_s_per_um if v_um_s > 0.0 else self.model.b_unloading_uN_s_per_um
 
+    @property
+    def _stronger_damper(self) -> float:
+        return max(self.model.b_loading_uN_s_per_um, self.model.b_unloading_uN_s_per_um)
+
     def _model_sigma_uN(self, x_um: float, v_um_s: float) -> float:
         """Standard deviation from the parameters' covariance; that of the damper while it damps like in loading."""
         if not self.model.covariance:
@@ -213,12 +219,15 @@ class VisionForce:
 class _Lag:
     """By how much a velocity may be off because it is that of an earlier instant: as the speed has changed lately.
 
-    Told by velocities that have no position in common, and no corner between; what their noise explains is taken off.
+    Told by velocities that have no position in common, and no corner between, for slow changes; for quick ones by what
+    the newest positions of each say otherwise than all of them. What their noise explains is taken off. The largest of
+    the last two windows counts, also of before a corner; at a corner, half of its step.
     """
 
     def __init__(self, window: int) -> None:
         self._told: deque[InstantMotion] = deque(maxlen=window)
         self._change_um_s2: deque[float] = deque(maxlen=2 * window)
+        self._late_um_s: deque[float] = deque(maxlen=2 * window)
 
     def hidden_um_s(self, motion: InstantMotion) -> float:
         """Standard deviation of that, for the next motion told."""
@@ -230,4 +239,6 @@ class _Lag:
             change_um_s = math.sqrt(max((motion.velocity_um_s - before.velocity_um_s) ** 2 - noise, 0.0))
             self._change_um_s2.append(change_um_s * NS_PER_S / (motion.t_ns - before.t_ns))
         self._told.append(motion)
-        return abs(motion.velocity_age_s) * max(self._change_um_s2, default=0.0)
+        self._late_um_s.append(motion.late_um_s)
+        slow_um_s = abs(motion.velocity_age_s) * max(self._change_um_s2, default=0.0)
+        return math.hypot(max(slow_um_s, *self._late_um_s), 0.5 * motion.corner_um_s)

@@ -24,7 +24,8 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
 
     RUNS are recordings, or folders with some in or below them. Optical calibrations and force characterisations are
     estimated anew from what was recorded. A file that cannot be analysed has a row that says why; the exit status
-    is 1 if that is so of all of them. After Ctrl-C or a kill, run the same command again to resume.
+    is 1 if that is so of all of them. The column `doubtful` marks these rows, and those of runs that are not complete
+    or of whose recording something is lost. After Ctrl-C or a kill, run the same command again to resume.
 
     \b
     Examples:
@@ -32,7 +33,7 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
       microdrivers analyse monday/*.mcap --out monday.parquet
       microdrivers analyse runs/ --dask tcp://10.0.0.5:8786
     """
-    from microdrivers.routines.analysis import analyse_recordings, find_recordings
+    from microdrivers.routines.analysis import analyse_recordings, doubts, find_recordings
 
     files = find_recordings(runs)
     progress = TerminalProgress()
@@ -49,11 +50,11 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
     finally:
         progress.close()
     resumed = f", {report.resumed} of them from an earlier run" if report.resumed else ""
-    incomplete = f", {report.incomplete} with losses (see `losses` and `dropped`)" if report.incomplete else ""
-    click.echo(f"{out}: {_recordings(len(report.rows))}{resumed}, {report.failed} with errors{incomplete}")
+    doubtful = f", {len(report.doubtful)} doubtful" if report.doubtful else ""
+    click.echo(f"{out}: {_recordings(len(report.rows))}{resumed}, {report.failed} with errors{doubtful}")
     for row in report.rows:
-        if row["error"] is not None:
-            click.echo(f"  {row['file']}: {row['error']}", err=True)
+        if row["doubtful"]:
+            click.echo(f"  {row['file']}: {row['error'] or 'doubtful: ' + ', '.join(doubts(row))}", err=True)
     if report.failed == len(report.rows):
         sys.exit(EXIT_ERROR)
 

@@ -211,6 +211,6 @@ def _run(source: OpticsSource, settings: CalibratorSettings, known: dict[str, An
         "report.html": partial(write_optics_report, result),
     }
     status = output.finish(result, partial(optics_summary, result), files, complete=run.complete)
-    # A run that ended as planned, with a result that is none of its last zoom; the result's notes say why.
-    is_outdated = run.complete and not result.complete and not run.past_run.ended_by
-    return status or (EXIT_ERROR if is_outdated else EXIT_OK)
+    # A run that ended as planned, with a result that is not of its end; the result's notes say why.
+    ended_as_planned = run.complete and (run.past_run.lost_last or not run.past_run.ended_by)
+    return status or (EXIT_ERROR if ended_as_planned and not result.complete else EXIT_OK)

@@ -15,7 +15,7 @@ import click
 from microdrivers.cli.options import fields_given, refuse_options_given
 from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws, write_results
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
-from microdrivers.cli.run_output import RESULT, RecordingChoice, RunOutput, recording_options
+from microdrivers.cli.run_output import RECORDING, RESULT, RecordingChoice, RunOutput, recording_options
 from microdrivers.core.protocol_names import PROTOCOLS
 
 if TYPE_CHECKING:
@@ -260,6 +260,9 @@ def _tell_what_is_left(
 ) -> None:
     """Keep what an experiment that failed has measured, and what that says of the specimen."""
     folder, measured = output.folder, _measured(characterisation)
+    if not measured and characterisation.interrupted:
+        kept = f"; {folder / RECORDING} holds the samples until then" if (folder / RECORDING).exists() else ""
+        click.echo(f"interrupted before the specimen was pressed: there is no result{kept}", err=True)
     if measured and known["clock"] != "recorded" and write_results(folder, measured):
         click.echo(_what_to_do_with(folder / RECORD, characterisation.tells_nothing), err=True)
     if found is not None and write_results(folder, _files(_result(found, known, truth, output), output)):

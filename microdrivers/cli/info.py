@@ -48,7 +48,7 @@ def describe(recording: Recording) -> dict[str, Any]:
     from microdrivers.recording.views import start_ns
 
     begin_ns = start_ns(recording)
-    lost = [*map(str, recording.losses), *recording.drops]
+    lost = [*map(str, recording.losses), *recording.drops, *recording.skipped]
     topics: dict[str, dict[str, Any]] = {}
     for name, topic in recording.topics.items():
         topics[name] = {

@@ -53,7 +53,7 @@ def _finite(_context: click.Context, _parameter: click.Parameter, duration_s: fl
 @click.option("--compress-images", is_flag=True, help=COMPRESSION_HELP.capitalize())
 @click.option(
     "--on-failure", type=click.Choice(["stop", "go-on"]), default="stop", show_default=True,
-    help="What a full disk does: end the recording, or count what is lost and try again.",
+    help="What a full disk does, or another program that writes to FILE: end the recording, or count what is lost.",
 )  # fmt: skip
 def record(
     choice: RigChoice,
@@ -170,7 +170,7 @@ def _run(clock: Clock, recorder: Recorder, duration_s: float | None) -> None:
     live = sys.stderr.isatty()
     period_s = _LINE_PERIOD_S if live else _PLAIN_LINE_PERIOD_S
     begin_ns = before_ns = clock.now_ns()
-    before: dict[str, int] = {}
+    before = {topic: count.messages for topic, count in recorder.counts.items()}
     end_s = float("inf") if duration_s is None else duration_s
     try:
         while (elapsed_s := (clock.now_ns() - begin_ns) / NS_PER_S) < end_s and not recorder.stopped:
@@ -202,7 +202,7 @@ def _line(
     from microdrivers.recording.channels import TRUTH_PREFIX
 
     rates = " · ".join(
-        f"{topic} {(number - before.get(topic, 0)) / period_s:.0f}/s"
+        f"{topic} {(number - before.get(topic, 0)) / max(period_s, _LOOK_PERIOD_S):.0f}/s"
         for topic, number in sorted(messages.items(), key=lambda item: item[0].startswith(TRUTH_PREFIX))
         if number > before.get(topic, 0)
     )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
+
+from microdrivers.cli.exit_codes import EXIT_ERROR
 
 
 @click.command(short_help="Make a torn or damaged recording readable by any MCAP tool.")
@@ -14,7 +17,8 @@ def repair(file: Path, out: Path | None) -> None:
     """Write all of FILE that is intact to a new file, which any MCAP reader reads. FILE stays as it is.
 
     For recordings of a program that was killed, of a full disk or a bad copy. Chunks whose CRC does not match are left
-    out; what was kept and what was lost is told.
+    out; what was kept and what was lost is listed. The exit status is 1 if something was lost and no message could be
+    kept. A repair that is killed leaves FILE2.NUMBER.part behind, to be deleted.
 
     \b
     Examples:
@@ -25,7 +29,9 @@ def repair(file: Path, out: Path | None) -> None:
 
     target = out or file.with_name(f"{file.stem}.repaired.mcap")
     report = write_repaired(file, target)
-    click.echo(f"{report.out}: {sum(report.messages.values())} messages kept")
+    messages = sum(report.messages.values())
+    intact = report.size - report.lost_bytes
+    click.echo(f"{report.out}: {messages} messages kept, from {intact} of {report.size} bytes")
     width = max(map(len, report.messages), default=0)
     for topic, number in report.messages.items():
         click.echo(f"  {topic:<{width}}  {number}")
@@ -40,3 +46,5 @@ def repair(file: Path, out: Path | None) -> None:
     click.echo(f"lost {report.lost_bytes} of {report.size} bytes:" if report.lost_bytes else "lost:")
     for loss in report.losses:
         click.echo(f"  {loss}")
+    if not messages:
+        sys.exit(EXIT_ERROR)

@@ -183,7 +183,8 @@ class RunOutput:
         recorder = self._recorder
         if recorder is None:
             return []
-        lacks = f"; it lacks {recorder.dropped} samples that could not be written" if recorder.dropped else ""
+        why = "" if recorder.disturbance else " that could not be written"
+        lacks = f"; it lacks {recorder.dropped} samples{why}" if recorder.dropped else ""
         return [f"{RECORDING} ({recorder.size / 1e6:.1f} MB{lacks})"]
 
 

@@ -31,7 +31,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False, kw_only=True):
         dt_ns: half-width of the 95 % interval of `t_ns`, ns.
         t_source: where the time came from.
         device: name of the publishing device or estimator.
-        seq: per-device counter from 0; a gap means that samples were lost.
+        seq: goes up by 1 from sample to sample of a topic; a gap means that samples were lost.
         order: bus-wide counter, stamped by the bus at the first publication; −1 before.
         flags: what is unusual about this sample; empty when all is well.
     """

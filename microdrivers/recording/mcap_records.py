@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple, Protocol
 
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import DataEnd, Footer, McapRecord, SummaryOffset
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    SummaryOffset,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
@@ -24,6 +39,65 @@ CHUNK = struct.Struct("<BQQQQII")
 _MESSAGE_HEAD = MESSAGE.size - RECORD.size
 _FOOTER = struct.Struct("<BQQQ")
 """All of it but its CRC, which covers this, too."""
+_Known = Header | Metadata | Attachment | Footer | Schema | Channel | AttachmentIndex | MetadataIndex
+
+
+class _Kind(Protocol):
+    @staticmethod
+    def read(stream: ReadDataStream) -> _Known: ...
+
+
+_KINDS: dict[int, _Kind] = {
+    Opcode.HEADER: Header, Opcode.METADATA: Metadata, Opcode.ATTACHMENT: Attachment, Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+}  # fmt: skip
+
+
+def parsed(opcode: int, body: bytes) -> _Known | None:
+    """The record, if it is of a kind that is needed and can be read."""
+    kind = _KINDS.get(opcode)
+    if kind is None:
+        return None
+    try:
+        return kind.read(ReadDataStream(io.BytesIO(body)))
+    except (McapError, struct.error, UnicodeDecodeError):
+        return None
+
+
+def read_definition(opcode: int, body: bytes) -> Schema | Channel | None:
+    """The schema or channel with that body; None if it is another record."""
+    record = parsed(opcode, body)
+    return record if isinstance(record, Schema | Channel) else None
+
+
+def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of the body of each record of a chunk or a summary that is intact."""
+    position = 0
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        position += RECORD.size
+        yield opcode, position, position + length
+        position += length
+
+
+class Written(NamedTuple):
+    """A chunk, metadata or an attachment that was written.
+
+    Attributes:
+        listing: its record in the summary.
+        offset: where it is, bytes.
+        head: what it begins with; of a chunk as far as its CRC, of others all.
+    """
+
+    listing: bytes
+    offset: int
+    head: bytes
+
+    @property
+    def is_chunk(self) -> bool:
+        """Whether it holds messages."""
+        return self.listing[0] == Opcode.CHUNK_INDEX
 
 
 def written(record: McapRecord) -> bytes:

@@ -7,7 +7,6 @@ other, and where they contradict, the next chunk that is intact is searched for.
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import re
 import struct
@@ -15,44 +14,33 @@ import weakref
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from microdrivers.recording.mcap_records import CHUNK, MAGIC, MESSAGE, RECORD
+from microdrivers.recording.mcap_records import CHUNK, MAGIC, MESSAGE, RECORD, parsed, records_in
+from microdrivers.recording.mcap_summary import Summary, find_end, read_footer, read_summary
 
 NOT_ENDED = "the recording was not ended"
 _END_MISSING = f"{NOT_ENDED}: at most its last 0.1 s are missing if its program was killed, more if its disk was full"
 
-_NO_SUMMARY = "the file's summary is damaged or cut off, or something follows it"
+_NO_SUMMARY = "the file's summary is damaged or cut off"
+_DATA_END_SIZE = 4
+_FOLLOWED = "the recording has its end here, but something follows it, which is not read"
 _INDEX = struct.Struct("<BQHI")
-_FOOTER_SIZE = 29
 _BLOCK_BYTES = 1 << 20
 _WINDOW_BYTES = 2048
 _LONGEST_CHUNK = 1 << 32
-_CHUNK_PATTERN = re.compile(rb"\x06(?=.{36}(?:\x00{4}|\x04\x00{3}zstd))", re.DOTALL)
+_COMPRESSIONS = (b"", b"lz4", b"zstd")
+_CHUNK_PATTERN = re.compile(rb"\x06(?=.{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd))", re.DOTALL)
 _LOOKAHEAD = CHUNK.size + 12
 _PAGE_BYTES = 4096
 """So much of a file an operating system reads or fails to read at once."""
 _OTHERS = frozenset({
     Opcode.HEADER, Opcode.FOOTER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END,
 })  # fmt: skip
-_Known = Header | Metadata | Attachment | Footer | Schema | Channel
-
-
-class _Kind(Protocol):
-    @staticmethod
-    def read(stream: ReadDataStream) -> _Known: ...
-
-
-_KINDS: dict[int, _Kind] = {
-    Opcode.HEADER: Header, Opcode.METADATA: Metadata, Opcode.ATTACHMENT: Attachment, Opcode.FOOTER: Footer,
-    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel,
-}  # fmt: skip
 
 
 class Loss(NamedTuple):
@@ -66,6 +54,10 @@ class Loss(NamedTuple):
     offset: int
     size: int
     what: str
+
+    def covers(self, offset: int) -> bool:
+        """Whether that byte is part of it."""
+        return self.offset <= offset < self.offset + self.size
 
     def __str__(self) -> str:
         return f"{self.what} ({self.size} bytes at byte {self.offset})" if self.size else self.what
@@ -86,7 +78,7 @@ class McapScan:
     Attributes:
         profile: of the file's header record; None if that is damaged.
         complete: whether the file has its end, a summary aside.
-        chunks, metadata, attachments: in the order of the file. channels, schemas: those of its summary, by number.
+        chunks: in the order of the file. channels, schemas: those of its summary, by number.
         losses: what is damaged outside of chunks.
 
     Raises:
@@ -98,15 +90,14 @@ class McapScan:
         self.profile: str | None = None
         self.complete = False
         self.chunks: list[ChunkPlace] = []
-        self.metadata: list[Metadata] = []
-        self.attachments: list[Attachment] = []
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.losses: list[Loss] = []
         self._unreadable: dict[int, str] = {}
+        self._records: dict[int, Metadata | Attachment] = {}
         self._stream = file.open("rb", buffering=0)
         self._close = weakref.finalize(self, self._stream.close)
-        self.size = os.fstat(self._stream.fileno()).st_size
+        self.size = self._end = os.fstat(self._stream.fileno()).st_size
         self.has_magic = os.pread(self._stream.fileno(), len(MAGIC), 0) == MAGIC
         if not self.has_magic and self.size:
             self.losses.append(Loss(0, len(MAGIC), "the file does not begin as an MCAP file does"))
@@ -116,6 +107,16 @@ class McapScan:
     def close(self) -> None:
         """No chunk can be read after it."""
         self._close()
+
+    @property
+    def metadata(self) -> list[Metadata]:
+        """In the order of the file."""
+        return [record for record in self._records.values() if isinstance(record, Metadata)]
+
+    @property
+    def attachments(self) -> list[Attachment]:
+        """In the order of the file."""
+        return [record for record in self._records.values() if isinstance(record, Attachment)]
 
     @property
     def unreadable(self) -> list[Loss]:
@@ -128,20 +129,24 @@ class McapScan:
 
     def read_chunk(self, place: ChunkPlace) -> bytes | Loss:
         """A chunk's records, or what is wrong with it."""
-        head = self._read(place.offset, CHUNK.size)
+        head = self._read(place.offset, _LOOKAHEAD)
         if len(head) < CHUNK.size:
             return Loss(place.offset, len(head), "the file ends in the middle of a chunk")
-        *_, size, crc, name_size = CHUNK.unpack(head)
+        *_, size, crc, name_size = CHUNK.unpack_from(head)
         skipped = CHUNK.size + name_size + 8
         data = self._read(place.offset + skipped, place.length - skipped)
         if name_size:
             try:
-                data = zstandard.decompress(data, size)
-            except zstandard.ZstdError:
+                data = _decompressed(data, head[CHUNK.size : CHUNK.size + name_size], size)
+            except (zstandard.ZstdError, RuntimeError):
                 return Loss(place.offset, place.length, "a compressed chunk is damaged")
         if len(data) != size or zlib.crc32(data) != crc:
             return Loss(place.offset, place.length, "a chunk is damaged: its CRC does not match")
         return data
+
+    def begins_with(self, place: ChunkPlace, head: bytes) -> bool:
+        """Whether the chunk does."""
+        return self._read(place.offset, len(head)) == head
 
     def contradictions(self, place: ChunkPlace, chunk: bytes) -> list[Loss]:
         """What the chunk's header and its indexes, which no CRC covers, say otherwise than the intact chunk itself."""
@@ -209,18 +214,22 @@ class McapScan:
                 offset = following
             elif head[0] == Opcode.DATA_END:
                 self.complete = True
+                if self._end < self.size:
+                    self.losses.append(Loss(self._end, self.size - self._end, _FOLLOWED))
                 return
             else:
                 offset += length
-        if self.size:
-            self.losses.append(Loss(self.size, 0, _END_MISSING))
 
     def _take_up(self, head: bytes, offset: int, length: int) -> bool:
         """Take up the record that begins with `head`; False if it is damaged, and perhaps its length too."""
         opcode = head[0]
         if opcode == Opcode.CHUNK:
             self.chunks.append(ChunkPlace(offset, length, {}, compressed=head[CHUNK.size - 4] > 0))
-        elif opcode != Opcode.DATA_END and not self._other_record(opcode, offset, length):
+        elif opcode == Opcode.DATA_END:
+            end = find_end(self._read, offset + length, self.size)
+            self._end = end or self.size
+            return end is not None
+        elif not self._other_record(opcode, offset, length):
             return self._plausible(self._read(offset + length, _LOOKAHEAD), offset + length) is not None
         return True
 
@@ -240,10 +249,10 @@ class McapScan:
         if len(head) < RECORD.size:
             return None
         opcode, length = RECORD.unpack_from(head)
-        agrees = opcode in _OTHERS
+        agrees = opcode in _OTHERS and (opcode != Opcode.DATA_END or length == _DATA_END_SIZE)
         if opcode == Opcode.CHUNK and len(head) >= CHUNK.size + 8:
             *_, size, _crc, name_size = CHUNK.unpack_from(head)
-            if name_size in (0, 4) and len(head) >= CHUNK.size + name_size + 8:
+            if head[CHUNK.size : CHUNK.size + name_size] in _COMPRESSIONS and len(head) >= CHUNK.size + name_size + 8:
                 (stored,) = struct.unpack_from("<Q", head, CHUNK.size + name_size)
                 agrees = length == CHUNK.size - RECORD.size + name_size + 8 + stored
                 agrees = agrees and (stored == size if not name_size else size < _LONGEST_CHUNK)
@@ -252,13 +261,11 @@ class McapScan:
     def _other_record(self, opcode: int, offset: int, length: int) -> bool:
         """Take up what lies between chunks; False if it is damaged."""
         body = self._read(offset, length)
-        record = _parsed(opcode, body[RECORD.size :])
-        if isinstance(record, Header):
+        record = parsed(opcode, body[RECORD.size :])
+        if isinstance(record, Header) and offset == len(MAGIC):
             self.profile = record.profile
-        elif isinstance(record, Metadata):
-            self.metadata.append(record)
-        elif isinstance(record, Attachment) and struct.unpack("<I", body[-4:])[0] == zlib.crc32(body[RECORD.size : -4]):
-            self.attachments.append(record)
+        elif isinstance(record, Metadata) or (isinstance(record, Attachment) and _has_its_crc(body)):
+            self._records[offset] = record
         else:
             self.losses.append(Loss(offset, length, f"a record of kind {opcode} is damaged"))
             return False
@@ -280,25 +287,56 @@ class McapScan:
         return self.size
 
     def _read_summary(self) -> None:
-        """Channels and schemas as the end of the file repeats them."""
-        tail = self._read(max(0, self.size - _FOOTER_SIZE - len(MAGIC)), _FOOTER_SIZE + len(MAGIC))
-        ends = tail[:1] == bytes([Opcode.FOOTER]) and tail[_FOOTER_SIZE:] == MAGIC
-        footer = _parsed(Opcode.FOOTER, tail[RECORD.size : _FOOTER_SIZE]) if ends else None
-        if not isinstance(footer, Footer) or not 0 < footer.summary_start < self.size:
+        """Channels and schemas as the end of the file repeats them, and what it lists that was not found."""
+        footer = read_footer(self._read, self._end)
+        if footer is None:
             if self.complete:
                 self.losses.append(Loss(0, 0, _NO_SUMMARY))
+            elif self.size:
+                self.losses.append(Loss(self.size, 0, _END_MISSING))
             return
         self.complete = True
-        summary = self._read(footer.summary_start, self.size - _FOOTER_SIZE - len(MAGIC) - footer.summary_start)
-        if zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary)) != footer.summary_crc:
-            self.losses.append(Loss(footer.summary_start, len(summary), _NO_SUMMARY))
+        summary = read_summary(self._read, footer, self._end)
+        if summary is None:
+            self.losses.append(Loss(footer.summary_start, self._end - footer.summary_start, _NO_SUMMARY))
             return
-        for opcode, start, end in records_in(summary):
-            record = _parsed(opcode, summary[start:end])
-            if isinstance(record, Schema):
-                self.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self.channels[record.id] = record
+        self.channels, self.schemas = summary.channels, summary.schemas
+        self._compare(summary)
+
+    def _compare(self, summary: Summary) -> None:
+        """Tell what the summary lists in vain, and leave out what it does not list: that is of another recording."""
+        records = {offset: record.name for offset, record in self._records.items()}
+        missing = [(offset, 0, f"the record {name!r}") for offset, name in summary.records.items()
+                   if records.get(offset) != name]  # fmt: skip
+        places = {place.offset for place in self.chunks}
+        missing += [(offset, size, "a chunk") for offset, size in summary.chunks.items() if offset not in places]
+        for offset, size, what in missing:
+            if not any(loss.covers(offset) for loss in self.losses):
+                self.losses.append(Loss(offset, size, f"{what} is damaged or missing"))
+        others = [place for place in self.chunks if summary.chunks and place.offset not in summary.chunks]
+        if others:
+            size = sum(place.length for place in others)
+            self.losses.append(Loss(others[0].offset, size, f"{len(others)} chunks are of another recording"))
+            self.chunks = [place for place in self.chunks if place.offset in summary.chunks]
+            self._records = {offset: each for offset, each in self._records.items() if offset in summary.records}
+
+
+def _has_its_crc(attachment: bytes) -> bool:
+    return attachment[-4:] == struct.pack("<I", zlib.crc32(attachment[RECORD.size : -4]))
+
+
+def _decompressed(data: bytes, compression: bytes, size: int) -> bytes:
+    """At most `size` bytes of it.
+
+    Raises:
+        ZstdError, RuntimeError: it is damaged.
+    """
+    if compression == b"zstd":
+        return zstandard.decompress(data, size)
+    import lz4.frame  # type: ignore[import-untyped]  # other programs compress with it
+
+    found: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, size)
+    return found
 
 
 def _indexes_in(data: bytes) -> Iterator[tuple[int, list[int]]]:
@@ -307,30 +345,3 @@ def _indexes_in(data: bytes) -> Iterator[tuple[int, list[int]]]:
         if end <= len(data):
             (channel,) = struct.unpack_from("<H", data, start)
             yield channel, list(struct.unpack_from(f"<{(end - start - 6) // 8}Q", data, start + 6))
-
-
-def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, begin and end of the body of each record of a chunk or a summary that is intact."""
-    position = 0
-    while position + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, position)
-        position += RECORD.size
-        yield opcode, position, position + length
-        position += length
-
-
-def read_definition(opcode: int, body: bytes) -> Schema | Channel | None:
-    """The schema or channel with that body; None if it is another record."""
-    record = _parsed(opcode, body)
-    return record if isinstance(record, Schema | Channel) else None
-
-
-def _parsed(opcode: int, body: bytes) -> _Known | None:
-    """The record, if it is of a kind that is needed and can be read."""
-    kind = _KINDS.get(opcode)
-    if kind is None:
-        return None
-    try:
-        return kind.read(ReadDataStream(io.BytesIO(body)))
-    except (McapError, struct.error, UnicodeDecodeError):
-        return None

@@ -7,16 +7,17 @@ system where they lie. What reaches the file is whole chunks: one that cannot be
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema, Statistics
 
-from microdrivers.recording.mcap_records import CHUNK, MAGIC, RECORD, end_of_file, message_record, written
+from microdrivers.recording.mcap_records import CHUNK, MAGIC, RECORD, Written, end_of_file, message_record, written
 
 _CHUNK_BYTES = 64 * 1024
 _ZSTD = "zstd"
@@ -26,16 +27,19 @@ _U64 = struct.Struct("<Q")
 
 
 class Output(Protocol):
-    """An unbuffered file that can be taken back to an earlier size."""
+    """An unbuffered file that can be taken back to an earlier size, and read."""
 
     def write(self, data: bytes | memoryview, /) -> int | None:
         """Write some of it; tells how much."""
 
+    def read(self, size: int, /) -> bytes | None:
+        """So much of it, or less at its end."""
+
     def truncate(self, size: int, /) -> int:
         """Cut off what is behind `size`."""
 
-    def seek(self, offset: int, /) -> int:
-        """Write there next."""
+    def seek(self, offset: int, whence: int = ..., /) -> int:
+        """Write there next, and tell where that is; `whence` 2: counted from the end."""
 
 
 class ChannelKey(NamedTuple):
@@ -67,14 +71,14 @@ class _Held(NamedTuple):
 
     Attributes:
         size: of the file, bytes.
-        indexes: how many of the writer's are of records that are in the file.
+        written: how many of the records that the writer knows are in the file.
         counts: messages by channel; a channel that is not in it has not been defined in the file.
         first_ns, last_ns: earliest and latest log time.
         chunk: waits to be written.
     """
 
     size: int
-    indexes: int
+    written: int
     counts: Mapping[int, int]
     first_ns: int | None
     last_ns: int
@@ -87,18 +91,22 @@ class McapWriter:
     An interruption (`KeyboardInterrupt`) may come at any moment: what has not reached the file by then is written with
     the next chunk.
 
+    Attributes:
+        disturbed: whether, before a write, the file was not as it was left: another program has written to it.
+
     Raises:
         OSError: the file's first record cannot be written.
     """
 
     def __init__(self, output: Output, *, profile: str, library: str, compress_images: bool = False) -> None:
+        self.disturbed = False
         self._output = output
         self._torn = False
         self._compress_images = compress_images
         self._channels: dict[ChannelKey, Channel] = {}
         self._schemas: dict[tuple[str, bytes], Schema] = {}
         self._definitions: dict[int, bytes] = {}
-        self._indexes: list[bytes] = []
+        self._written: list[Written] = []
         self._held = _Held(0, 0, {}, None, 0, _Chunk())
         self._write([MAGIC, written(Header(profile, library))])
 
@@ -106,6 +114,11 @@ class McapWriter:
     def size(self) -> int:
         """Bytes in the file."""
         return self._held.size
+
+    @property
+    def written(self) -> Sequence[Written]:
+        """What is in the file, in its order, header and summary aside."""
+        return self._written[: self._held.written]
 
     def count(self, channel: int) -> int:
         """How many messages of the channel are in the file."""
@@ -209,7 +222,7 @@ class McapWriter:
             struct.pack("<QI", len(indexes), len(name)), name, struct.pack("<QQ", stored, size),
         ))  # fmt: skip
         self._write(
-            [head, *parts, indexes], RECORD.pack(Opcode.CHUNK_INDEX, len(body)) + body,
+            [head, *parts, indexes], Written(RECORD.pack(Opcode.CHUNK_INDEX, len(body)) + body, held.size, head),
             counts={**held.counts, **{number: self.count(number) + len(index[number]) // 2 for number in index}},
             first_ns=first_ns if held.first_ns is None else min(held.first_ns, first_ns),
             last_ns=max(held.last_ns, last_ns), chunk=_Chunk(),
@@ -247,7 +260,7 @@ class McapWriter:
         """
         record = written(Metadata(name=name, metadata=dict(data)))
         index = MetadataIndex(offset=self.size, length=len(record), name=name)
-        self._write([record], written(index))
+        self._write([record], Written(written(index), index.offset, record))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, *, log_ns: int) -> None:
         """Write an attachment at once.
@@ -261,7 +274,7 @@ class McapWriter:
             offset=self.size, length=len(record), log_time=log_ns, create_time=0, data_size=len(data), name=name,
             media_type=media_type,
         )  # fmt: skip
-        self._write([record], written(index))
+        self._write([record], Written(written(index), index.offset, record))
 
     def finish(self) -> None:
         """Write the summary and the end, all chunks having been flushed.
@@ -273,8 +286,8 @@ class McapWriter:
         indexes: dict[int, list[bytes]] = {
             Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
         }  # fmt: skip
-        for index in self._indexes[: held.indexes]:
-            indexes[index[0]].append(index)
+        for record in self.written:
+            indexes[record.listing[0]].append(record.listing)
         defined = [channel for channel in self._channels.values() if channel.id in held.counts]
         schemas = {channel.schema_id for channel in defined}
         statistics = Statistics(
@@ -291,12 +304,13 @@ class McapWriter:
         }
         self._write([end_of_file(groups, offset=held.size)])
 
-    def _write(self, parts: list[_Part], *indexes: bytes, **changes: Any) -> None:
+    def _write(self, parts: list[_Part], *records: Written, **changes: Any) -> None:
         """Write all of it or nothing; with its last byte, `changes` of what is held count."""
+        self._see_that_nobody_else_writes()
         if self._torn:
             self._take_back()
-        del self._indexes[self._held.indexes :]
-        self._indexes += indexes
+        del self._written[self._held.written :]
+        self._written += records
         self._torn = True
         size = self._held.size
         try:
@@ -306,12 +320,22 @@ class McapWriter:
                     count = self._output.write(rest) or 0
                     rest = rest[count:]
                     size += count
-            self._held = self._held._replace(size=size, indexes=len(self._indexes), **changes)
+            self._held = self._held._replace(size=size, written=len(self._written), **changes)
             self._torn = False
         except BaseException:  # also an interruption
             with contextlib.suppress(OSError):  # it is tried again before the next write
                 self._take_back()
             raise
+
+    def _see_that_nobody_else_writes(self) -> None:
+        """Look at the file's size, and at what was written last; a program that cuts it off may do so at any moment."""
+        if not self.disturbed:
+            size = self._output.seek(0, os.SEEK_END)
+            self.disturbed = size < self.size or (size > self.size and not self._torn)
+            for record in self._written[: self._held.written][-1:]:
+                self._output.seek(record.offset)
+                self.disturbed |= self._output.read(len(record.head)) != record.head
+        self._output.seek(self.size)
 
     def _take_back(self) -> None:
         self._output.truncate(self.size)

@@ -43,7 +43,7 @@ def create_file(file: Path) -> OutputFile:
     """
     refuse_existing(file)
     try:
-        return file.open("xb", buffering=0)
+        return file.open("x+b", buffering=0)
     except OSError as error:
         raise not_writable(file, error) from error
 

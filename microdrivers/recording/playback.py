@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Collection
-from pathlib import Path
 
 from microdrivers.core.bus import Bus, Topic
 from microdrivers.core.clock import Clock, SimulatedClock
@@ -105,7 +105,9 @@ class RecordingPlayback:
         self.close()
 
 
-def open_replay(file: Path, *, clock: Clock | None = None, leave_out: Collection[str] = ()) -> RecordingPlayback:
+def open_replay(
+    file: str | os.PathLike[str], *, clock: Clock | None = None, leave_out: Collection[str] = ()
+) -> RecordingPlayback:
     """Open a recording to publish it again, in the order in which it was published.
 
     Args:
@@ -117,4 +119,4 @@ def open_replay(file: Path, *, clock: Clock | None = None, leave_out: Collection
     Raises:
         ConfigError, EmptyRecording, ForeignRecording, FutureRecording: it cannot be read.
     """
-    return RecordingPlayback(Recording(Path(file)), clock=clock or SimulatedClock(), leave_out=leave_out)
+    return RecordingPlayback(Recording(file), clock=clock or SimulatedClock(), leave_out=leave_out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property
@@ -12,30 +13,15 @@ from typing import Generic, NamedTuple, TypeVar
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import Frame, Sample
 from microdrivers.recording.channels import ARRIVALS_TOPIC, matches
-from microdrivers.recording.errors import EmptyRecording, ForeignRecording, FutureRecording
-from microdrivers.recording.header import (
-    CLOCK_RECORD,
-    FAILURE_RECORD,
-    HEADER_RECORD,
-    PROFILE,
-    REPAIR_RECORD,
-    SCHEMA_VERSION,
-    ClockMapping,
-    RecordingHeader,
-    from_metadata,
-)
-from microdrivers.recording.mcap_records import MESSAGE, MESSAGE_BEGIN, RECORD
-from microdrivers.recording.mcap_scan import NOT_ENDED, ChunkPlace, Loss, McapScan, read_definition
+from microdrivers.recording.mcap_records import MESSAGE, MESSAGE_BEGIN, RECORD, read_definition
+from microdrivers.recording.mcap_scan import NOT_ENDED, ChunkPlace, Loss
+from microdrivers.recording.opening import open_scan, read_clock_record, read_header, told_losses
 from microdrivers.recording.recorded_channels import Action, ChannelReader, FrameJoin, Unreadable, channel_reader
-from microdrivers.recording.survey import Survey, TopicSummary
+from microdrivers.recording.survey import Survey, TopicSummary, unexplained_gaps
 
 __all__ = ["Recording", "TopicSummary"]
-
-LIST_MARK = "; "
-"""Between the losses in a repaired file's metadata."""
 
 FoundT = TypeVar("FoundT")
 
@@ -63,10 +49,10 @@ class Recording:
         FutureRecording: a newer version wrote it.
     """
 
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._scan = open_scan(file)
-        self._told = list(_told_losses(self._scan))
+    def __init__(self, file: str | os.PathLike[str]) -> None:
+        self.file = Path(file)
+        self._scan = open_scan(self.file)
+        self._told = list(told_losses(self._scan))
         self.complete = self._scan.complete and not any(NOT_ENDED in loss.what for loss in self._told)
         self.header = read_header(self._scan)
         self.clock = read_clock_record(self._scan)
@@ -158,12 +144,17 @@ class Recording:
         ]
 
     @property
+    def skipped(self) -> list[str]:
+        """What is not there for no reason that is known, by topic; the first look at it reads all of the file."""
+        return [] if self.losses else unexplained_gaps(self.topics)
+
+    @property
     def flaws(self) -> list[str]:
         """What whoever uses the recording should be told; the first look at it reads all of the file.
 
-        That is all that cannot be read, what the recorder itself has lost, and samples out of the order of time.
+        That is all that cannot be read, is not there or was lost by the recorder, and samples out of order of time.
         """
-        told = [*(f"not readable: {loss}" for loss in self._damage), *map(str, self._told), *self.drops]
+        told = [*(f"not readable: {loss}" for loss in self._damage), *map(str, self._told), *self.drops, *self.skipped]
         for name, topic in self.topics.items():
             if topic.unsorted:
                 told.append(f"out of order: {topic.unsorted} samples of {name!r} are older than their predecessor")
@@ -267,79 +258,7 @@ class Recording:
         return made
 
 
-def open_scan(file: Path) -> McapScan:
-    """The intact records of a file.
-
-    Raises:
-        ConfigError: there is no such file, or it may not be read.
-    """
-    try:
-        return McapScan(file)
-    except OSError as error:
-        raise ConfigError(
-            f"the recording cannot be read: {error.strerror}", file=str(file), remedy="check the path"
-        ) from error
-
-
-def _told_losses(scan: McapScan) -> Iterator[Loss]:
-    """What the file's metadata tell of losses."""
-    for record in scan.metadata:
-        if record.name == REPAIR_RECORD and (losses := record.metadata.get("losses")):
-            yield from (Loss(0, 0, f"lost before the repair: {loss}") for loss in losses.split(LIST_MARK))
-        elif record.name == FAILURE_RECORD:
-            reason = record.metadata.get("reason", "unknown")
-            yield Loss(0, 0, f"the recording was stopped because it could not be written: {reason}")
-
-
 def _holds_an_unwanted_image(place: ChunkPlace, actions: Mapping[int, object | None]) -> bool:
     """Whether the chunk holds nothing but an image and its info, and neither is asked for."""
     numbers = list(place.holds.items())
     return len(numbers) == 2 and all(count == 1 and actions.get(number, place) is None for number, count in numbers)
-
-
-def read_clock_record(scan: McapScan) -> ClockMapping | None:
-    """The last record of the clock that is intact; of others a loss is told."""
-    records = [record.metadata for record in scan.metadata if record.name == CLOCK_RECORD]
-    read = [from_metadata(data, ClockMapping) for data in records]
-    intact = [clock for clock in read if clock is not None]
-    if len(intact) < len(read):
-        known = "another one is intact" if intact else "how its times relate to the calendar's is not known"
-        end = " of its end" if intact and read[-1] is None else ""
-        scan.losses.append(Loss(0, 0, f"the recording's clock record{end} is damaged: {known}"))
-    return intact[-1] if intact else None
-
-
-def read_header(scan: McapScan) -> RecordingHeader:
-    """The recording's header, if the file is one.
-
-    Raises:
-        EmptyRecording, ForeignRecording, FutureRecording: it cannot be read as one.
-    """
-    file = scan.file
-    if scan.size == 0:
-        raise EmptyRecording(f"{file} is empty", remedy="record anew: nothing was written to it")
-    records = [record.metadata for record in scan.metadata if record.name == HEADER_RECORD]
-    headers = [header for data in records if (header := from_metadata(data, RecordingHeader)) is not None]
-    if headers:
-        _check_version(file, headers[0].schema_version, headers[0].microdrivers)
-        if len(headers) < len(records):
-            scan.losses.append(Loss(0, 0, "one of the recording's headers is damaged: another one is intact"))
-        return headers[0]
-    for data in records:
-        number = data.get("schema_version", "")
-        _check_version(file, int(number) if number.isdecimal() else 0, data.get("microdrivers", ""))
-    if scan.profile == PROFILE and scan.chunks:
-        scan.losses.append(Loss(0, 0, "the recording's header is damaged: who made it is not known"))
-        return RecordingHeader(source="recorded")
-    if scan.profile == PROFILE or (scan.has_magic and scan.profile is None and not scan.chunks):
-        raise EmptyRecording(f"{file} ends before its first complete record", remedy="record anew")
-    what = "an MCAP file, but microdrivers did not write it" if scan.has_magic else "no MCAP file"
-    raise ForeignRecording(f"{file} is {what}", remedy="name a file that `microdrivers record` has written")
-
-
-def _check_version(file: Path, number: int, writer: str) -> None:
-    if number > SCHEMA_VERSION:
-        raise FutureRecording(
-            f"{file} has schema version {number}; this microdrivers reads up to {SCHEMA_VERSION}",
-            remedy=f"install microdrivers {writer or 'as it wrote the file'} or newer",
-        )

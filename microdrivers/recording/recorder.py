@@ -87,6 +87,7 @@ class Recorder:
         self._failure: OSError | None = None
         self._closed = False
         self._complete = False
+        self._is_as_written = True
         start = read_clock(clock)
         output = create_file(file)
         try:
@@ -133,19 +134,26 @@ class Recorder:
 
     @property
     def stopped(self) -> bool:
-        """Whether the main program is to end the recording: the file could not be written, and `on_failure` is `stop`.
+        """Whether the main program is to end the recording: the file fails, and `on_failure` is `stop`.
+
+        That is: it could not be written, or another program writes to it.
 
         It is asked, not interrupted: an error out of its next wait might come while it tells a device to stop.
         """
-        return self._failure is not None and self._on_failure == "stop"
+        return (self._failure is not None or self._out.disturbed) and self._on_failure == "stop"
 
     @property
     def disturbance(self) -> str:
-        """What has become of the file by somebody else's hand; empty if neither its name nor its size tells."""
-        now = _status(self.file)
-        if now is None or self._made is None or not os.path.samestat(now, self._made):
+        """What has become of the file by somebody else's hand; empty if nothing tells of any."""
+        if self._is_gone():
             return "gone: it, or its disk, was removed, renamed or replaced during the recording"
-        return "" if now.st_size == self.size else "corrupt: another program wrote to it during the recording"
+        now = _status(self.file)
+        is_whole = self._is_as_written and not self._out.disturbed and now is not None and now.st_size == self.size
+        return "" if is_whole else "corrupt: another program wrote to it during the recording"
+
+    def _is_gone(self) -> bool:
+        now = _status(self.file)
+        return now is None or self._made is None or not os.path.samestat(now, self._made)
 
     def wants(self, topic: str) -> bool:
         """Whether that topic is recorded, if there is one."""
@@ -211,6 +219,9 @@ class Recorder:
                     self._fail(error, "its end could not be written; what it holds can be read all the same")
             finally:
                 self._output.close()
+            if not self._is_gone():
+                with contextlib.suppress(OSError):
+                    self._is_as_written = self._out.look_back(self.file)
 
     def __enter__(self) -> Recorder:
         return self

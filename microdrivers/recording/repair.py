@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -20,11 +20,11 @@ from microdrivers.recording.header import (
     to_metadata,
 )
 from microdrivers.recording.images import IMAGE_SCHEMA
-from microdrivers.recording.mcap_records import MESSAGE, RECORD
-from microdrivers.recording.mcap_scan import Loss, McapScan, read_definition, records_in
+from microdrivers.recording.mcap_records import MESSAGE, RECORD, read_definition, records_in
+from microdrivers.recording.mcap_scan import Loss, McapScan
 from microdrivers.recording.mcap_writer import ChannelKey, McapWriter
+from microdrivers.recording.opening import LIST_MARK, open_scan, read_clock_record, read_header
 from microdrivers.recording.output import not_writable, refuse_existing, whole_file
-from microdrivers.recording.reader import LIST_MARK, open_scan, read_clock_record, read_header
 from microdrivers.recording.schemas import FrameInfo, schema_name
 
 
@@ -63,7 +63,7 @@ def repair(file: Path, out: Path) -> RepairReport:
         read_clock_record(scan)
         refuse_existing(out)
         try:
-            with whole_file(out) as part, part.open("wb", buffering=0) as output:
+            with whole_file(out) as part, part.open("w+b", buffering=0) as output:
                 writer = McapWriter(
                     output, profile=PROFILE, library="microdrivers repair",
                     compress_images=any(place.compressed for place in scan.chunks),
@@ -77,8 +77,17 @@ def repair(file: Path, out: Path) -> RepairReport:
         scan.close()
     return RepairReport(
         file=file, out=out, messages=dict(copy.messages), losses=copy.losses, mended=copy.mended,
-        backwards=dict(+copy.backwards), size=scan.size, lost_bytes=sum(loss.size for loss in copy.losses),
+        backwards=dict(+copy.backwards), size=scan.size, lost_bytes=_lost_bytes(copy.losses),
     )  # fmt: skip
+
+
+def _lost_bytes(losses: Iterable[Loss]) -> int:
+    """How many they are; some overlap."""
+    lost = end = 0
+    for offset, size, _ in sorted(losses):
+        lost += max(offset + size, end) - max(offset, end)
+        end = max(offset + size, end)
+    return lost
 
 
 class _Copy:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -21,6 +22,7 @@ from microdrivers.recording.header import (
     to_metadata,
 )
 from microdrivers.recording.images import IMAGE_SCHEMA, INFO_SUFFIX, encode_image, image_schema, info_of
+from microdrivers.recording.look_back import is_as_written, messages_left
 from microdrivers.recording.mcap_writer import ChannelKey, McapWriter, Output
 from microdrivers.recording.schemas import Arrivals, Drops, FrameInfo, schema_data, schema_name
 
@@ -117,6 +119,11 @@ class SampleFile:
         """Bytes in the file so far."""
         return self._writer.size
 
+    @property
+    def disturbed(self) -> bool:
+        """Whether another program was seen to write to the file, or to cut it off, while it was written."""
+        return self._writer.disturbed
+
     def add_topic(self, name: str, sample_type: type[Sample]) -> None:
         """Samples of that type will come on topic `name`.
 
@@ -198,7 +205,7 @@ class SampleFile:
     def flush(self, *, now_ns: int) -> None:
         """Hand all of it to the operating system, with a note of what was dropped since the last time."""
         self._flush_chunk()
-        self._count_lost()
+        self._count_lost(self._writer.count)
         dropped = {topic: count.dropped for topic, count in tuple(self.counts.items())}
         new = {topic: number for topic, number in dropped.items() if number != self._noted_drops.get(topic, 0)}
         try:
@@ -219,11 +226,22 @@ class SampleFile:
     def _failed(self, error: OSError) -> None:
         self._on_failure(error, "samples could not be written")
 
-    def _count_lost(self) -> None:
-        """What was taken and is not in the file is lost, if nothing waits."""
+    def look_back(self, file: Path) -> bool:
+        """Whether the file is as it was written; if not, what a reader does not find in it any more is counted as lost.
+
+        Raises:
+            OSError: it cannot be read.
+        """
+        if not self.disturbed and is_as_written(file, self._writer.written, self.size):
+            return True
+        self._count_lost(messages_left(file, self._writer.written).__getitem__)
+        return False
+
+    def _count_lost(self, held: Callable[[int], int]) -> None:
+        """What was taken and is not held by the file, in messages of a channel, is lost, if nothing waits."""
         arrivals = self._notes[ARRIVALS_TOPIC]
         for channel in (*tuple(self._channels.values()), arrivals):
-            channel.count.lost = channel.count.taken - self._writer.count(channel.image_number or channel.number)
+            channel.count.lost = channel.count.taken - held(channel.image_number or channel.number)
         if arrivals.count.lost:
             self.counts[ARRIVALS_TOPIC] = arrivals.count
 
@@ -253,4 +271,4 @@ class SampleFile:
                 self._writer.add_metadata(FAILURE_RECORD, {"reason": failure})
             self._writer.finish()
         finally:
-            self._count_lost()
+            self._count_lost(self._writer.count)

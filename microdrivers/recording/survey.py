@@ -21,7 +21,7 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
         count: how many samples can be read.
         first_t_ns, last_t_ns: earliest and latest instant, ns on the rig's clock; 0 if there are none.
         rate_hz: mean rate between these; NaN with fewer than two different instants.
-        gaps: how many `seq` numbers are missing between the first and the last sample.
+        gaps: how many `seq` numbers are missing between the lowest and the highest.
         unsorted: how many samples describe an instant before their predecessor's.
         dropped: how many the recorder itself has lost.
     """
@@ -34,6 +34,15 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
     gaps: int
     unsorted: int
     dropped: int
+
+
+def unexplained_gaps(topics: Mapping[str, TopicSummary]) -> list[str]:
+    """Samples that are not there though the recorder has not dropped them, by topic."""
+    return [
+        f"missing: {topic.gaps - topic.dropped} samples of {name!r}, whose numbers are skipped"
+        for name, topic in topics.items()
+        if topic.gaps > topic.dropped
+    ]
 
 
 class Survey:
@@ -86,28 +95,33 @@ class Survey:
 class _Count:
     """The running figures of one topic."""
 
-    __slots__ = ("count", "first_ns", "gaps", "last_ns", "previous_ns", "sample_type", "seq", "unsorted")
+    __slots__ = ("count", "first_ns", "first_seq", "last_ns", "last_seq", "previous_ns", "sample_type", "unsorted")
 
     def __init__(self, sample_type: type[Sample]) -> None:
         self.sample_type = sample_type
-        self.count = self.gaps = self.unsorted = self.seq = 0
+        self.count = self.unsorted = self.first_seq = 0
+        self.last_seq = -1
         self.first_ns = self.last_ns = self.previous_ns = 0
 
     def add(self, t_ns: int, seq: int) -> None:
         if self.count:
-            self.gaps += max(0, seq - self.seq - 1)
             self.unsorted += t_ns < self.previous_ns
             self.first_ns = min(self.first_ns, t_ns)
             self.last_ns = max(self.last_ns, t_ns)
+            if seq > self.last_seq:  # usually; threads publish side by side, and may overtake each other
+                self.last_seq = seq
+            elif seq < self.first_seq:
+                self.first_seq = seq
         else:
             self.first_ns = self.last_ns = t_ns
+            self.first_seq = self.last_seq = seq
         self.count += 1
-        self.seq, self.previous_ns = seq, t_ns
+        self.previous_ns = t_ns
 
     def summary(self, dropped: int) -> TopicSummary:
         span_ns = self.last_ns - self.first_ns
         return TopicSummary(
             sample_type=self.sample_type, count=self.count, first_t_ns=self.first_ns, last_t_ns=self.last_ns,
-            rate_hz=(self.count - 1) * NS_PER_S / span_ns if span_ns else float("nan"), gaps=self.gaps,
-            unsorted=self.unsorted, dropped=dropped,
+            rate_hz=(self.count - 1) * NS_PER_S / span_ns if span_ns else float("nan"),
+            gaps=max(0, self.last_seq - self.first_seq + 1 - self.count), unsorted=self.unsorted, dropped=dropped,
         )  # fmt: skip

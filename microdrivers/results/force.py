@@ -196,7 +196,8 @@ class ForceResult(Record):
     """A force characterisation, Bilen et al., sections II.B and III.C.
 
     Attributes:
-        complete: False if the run was interrupted; the estimates then come from what had been measured.
+        complete: False if the run was interrupted, or the recording of it lacks its end; the estimates then come from
+            what had been measured.
         best: the protocol that suits the record best.
         excluded_samples: reason → number of samples that no fit used.
         vision_force_error_percent: 100·RMS(F − F̂)/RMS(F) of the fresh indentation; None if there was none.

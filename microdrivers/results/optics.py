@@ -103,7 +103,8 @@ class OpticsResult(Record):
     """An optical calibration, Bilen et al., section III.B.
 
     Attributes:
-        complete: False if the run was interrupted; the estimates are then those up to the interruption.
+        complete: False if the run was interrupted, or its recording lacks its end: the estimates are then those up to
+            there. Also if the zoom changed where no frame could be used any more. The notes say which.
         projection: P, 2×3: (u, v) = P (X, Y, 1); px/µm and px from the principal point, v down; X, Y in µm.
         scale_px_per_um: M of eq. (5), from the similarity fit. `scale_sigma_px_per_um`: standard deviation.
         magnification: scale × pixel pitch, dimensionless; None if the pitch is unknown.

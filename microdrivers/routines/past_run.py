@@ -9,20 +9,25 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import Note
 
 _MOST_FLAWS = 8
+_LACKS_END = "the recording does not hold its end"
 
 
 class PastRun(NamedTuple):
     """What a result from a recording must carry; of a live run, nothing.
 
     Attributes:
-        ended_by: what ended the recorded run early; empty if nothing did.
+        ended_by: what ended the recorded run early, or why its end is not known; empty if all of it is recorded.
         flaws: what the recording lacks, or has wrong.
-        lost_frames: how many frames its estimator had and the recording lacks, where that is counted.
+        missing: how many samples its estimators had and the recording lacks.
+        lost_frames: how many of these are frames of the experiment, where that is counted.
+        lost_last: how many of these are its last ones.
     """
 
     ended_by: str = ""
     flaws: tuple[str, ...] = ()
+    missing: int = 0
     lost_frames: int = 0
+    lost_last: int = 0
 
     def notes(self) -> list[str]:
         """The flaws as a result's notes."""
@@ -34,7 +39,13 @@ class PastRun(NamedTuple):
 
 
 def past_run(
-    recording: Recording, done: Sequence[Note], *, missing: int, broken_off: str, lost_frames: int = 0
+    recording: Recording,
+    done: Sequence[Note],
+    *,
+    missing: int,
+    broken_off: str = "",
+    lost_frames: int = 0,
+    lost_last: int = 0,
 ) -> PastRun:
     """What a recording tells of its run.
 
@@ -42,11 +53,18 @@ def past_run(
         recording: what is replayed.
         done: the routine's notes of its end.
         missing: how many samples its estimators had and it does not hold.
-        broken_off: what else says that the run ended early, where no note of the end is found; empty: nothing does.
+        broken_off: where the run breaks off, if no note of its end is found; empty: that is not known.
         lost_frames: how many of `missing` are frames, where that is counted.
+        lost_last: how many of these are the last ones of the experiment.
     """
-    ended_by = str(done[-1].content["ended_by"]) if done else broken_off
+    if done:
+        last = "frame" if lost_last == 1 else f"{lost_last} frames"
+        ended_by = str(done[-1].content["ended_by"]) or (f"the recording lacks its last {last}" if lost_last else "")
+    elif recording.complete:
+        ended_by = broken_off or _LACKS_END
+    else:
+        ended_by = broken_off or "the recording was cut off, and does not tell the run's end"
     # First, as `info` does not tell it: what is behind the last flaw that has room is looked up there.
     frames = f", among them {lost_frames} frame{'s' * (lost_frames > 1)} of the experiment" if lost_frames else ""
     lacks = [f"it lacks {missing} sample{'s' * (missing > 1)} that the estimators had{frames}"] if missing else []
-    return PastRun(ended_by, (*lacks, *recording.flaws), lost_frames)
+    return PastRun(ended_by, (*lacks, *recording.flaws), missing, lost_frames, lost_last)

@@ -1,5 +1,6 @@
 """`calibrate force`: what cannot be analysed is refused, and what was measured is kept however it ends."""
 
+import contextlib
 import csv
 import json
 import pathlib
@@ -105,6 +106,25 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     assert "to analyse it" not in told
     assert source.whereabouts in told
     assert not (tmp_path / "result.json").exists()
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_an_interruption_before_the_press_says_that_there_is_no_result(tmp_path, capsys, monkeypatch, recorded):
+    def interrupted(_progress):
+        raise KeyboardInterrupt
+
+    source = MadeUpSource()
+    monkeypatch.setattr(source, "prepare", interrupted)
+    if recorded:
+        (tmp_path / "run.mcap").write_bytes(b"")
+    output = RunOutput("force", tmp_path, as_json=True)
+    monkeypatch.setattr(output, "recorded", lambda *_: contextlib.nullcontext())
+    output.folder = tmp_path
+    with pytest.raises(KeyboardInterrupt):
+        _run(source, dict(KNOWN), True, IdentificationSettings(), output)
+    told = capsys.readouterr().err
+    assert "interrupted before the specimen was pressed: there is no result" in told
+    assert (f"{tmp_path / 'run.mcap'} holds the samples until then" in told) is recorded
 
 
 def test_an_interruption_of_the_report_names_what_is_there(run, tmp_path, monkeypatch):

@@ -51,6 +51,12 @@ def test_the_live_line_fits_a_terminal(dropped):
     assert click.unstyle(_line(recorder, messages, {}, 1.0, 12.0, 500)).endswith("truth/optics 1000/s")
 
 
+def test_the_live_line_of_an_instant_tells_no_rate_of_what_came_before(run):
+    told = run("record", shipped_rig("microscope"), "--fake", "--for", 1e-9, "--out", "a.mcap").stderr
+    assert "0 s | " in told
+    assert told.endswith("0 dropped | nothing\n")
+
+
 def test_the_live_line_tells_how_long_the_disk_has_room(monkeypatch, tmp_path):
     recorder = SimpleNamespace(size=10**8, dropped=0, file=tmp_path / "a.mcap")
     for free, told in ((10**9, ", room for 100 s |"), (10**11, ", room for 2.8 h |"), (10**14, "100.0 MB |")):
@@ -144,6 +150,24 @@ def test_repair_tells_what_was_kept_and_lost(run, tmp_path):
     result = run("recording", "repair", "c.mcap")
     assert result.exit_code == 1
     assert "no MCAP file" in result.stderr
+
+
+def test_a_repair_that_keeps_nothing_fails(run, tmp_path):
+    run("record", shipped_rig("microscope"), "--fake", "--for", 0.3, "--out", "a.mcap")
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    with Recording(tmp_path / "a.mcap") as recording:
+        places = recording._scan.chunks
+    for place in places[:-1]:
+        data[place.offset + 60] ^= 1
+    (tmp_path / "a.mcap").write_bytes(data)
+    result = run("recording", "repair", "a.mcap", "--out", "b.mcap")
+    intact = len(data) - sum(place.length for place in places[:-1])
+    assert result.exit_code == 0
+    assert f" messages kept, from {intact} of {len(data)} bytes" in result.stdout
+    data[places[-1].offset + 60] ^= 1
+    (tmp_path / "a.mcap").write_bytes(data)
+    result = run("recording", "repair", "a.mcap", "--out", "c.mcap")
+    assert (result.exit_code, "c.mcap: 0 messages kept" in result.stdout) == (1, True)
 
 
 @pytest.mark.xdist_group("real_time")

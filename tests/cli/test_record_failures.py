@@ -153,7 +153,7 @@ def test_exports_to_a_full_disk_fail_and_leave_nothing(run, optics_recording, tm
     assert result.exit_code == 0, result.stderr
 
 
-@pytest.mark.parametrize("how", ["removed", "replaced", "written to"])
+@pytest.mark.parametrize("how", ["removed", "replaced", "written to", "emptied"])
 def test_a_recording_that_somebody_else_touches_is_told(run, tmp_path, prepared, how):
     file = tmp_path / "a.mcap"
 
@@ -162,16 +162,25 @@ def test_a_recording_that_somebody_else_touches_is_told(run, tmp_path, prepared,
             with file.open("ab") as stream:
                 stream.write(bytes(10**6))
             return
+        if how == "emptied":
+            file.write_bytes(b"")
+            return
         file.unlink()
         if how == "replaced":
             file.write_text("another")
 
     prepared(lambda rig: rig.clock.call_at(rig.clock.now_ns() + 50_000_000, remove, name="somebody"))
-    result = run("record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "zoom")
-    told = "corrupt: another program wrote to it" if how == "written to" else "gone: it, or its disk, was removed"
+    result = run(
+        "record", shipped_rig("microscope"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "zoom",
+        "--on-failure", "go-on",
+    )  # fmt: skip
+    corrupt = how in ("written to", "emptied")
+    told = "corrupt: another program wrote to it" if corrupt else "gone: it, or its disk, was removed"
     assert (result.exit_code, told in result.stdout) == (1, True), result.output
     if how == "written to":
         assert "something follows it" in run("info", "a.mcap").stdout
+    if how == "emptied":
+        assert "  lost       something is damaged here" in run("info", "a.mcap").stdout
 
 
 def test_a_recording_whose_end_was_interrupted_is_not_called_complete(run, tmp_path, monkeypatch):

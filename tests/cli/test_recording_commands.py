@@ -97,10 +97,15 @@ def test_info_tells_gaps_and_times_that_run_backwards(run, tmp_path):
     with Recorder(tmp_path / "a.mcap", bus=bus, clock=SimulatedClock(), header=RecordingHeader(source="fake")):
         for seq, t_ns in ((0, 1000), (1, 3000), (4, 2000)):
             bus.topic("f", ForceSample).publish(ForceSample(t_ns=t_ns, device="f", seq=seq, force_uN=0.0, raw_uN=0.0))
-        for seq in range(2):
+        for seq in (1, 0):
             bus.topic("g", ForceSample).publish(ForceSample(t_ns=seq, device="g", seq=seq, force_uN=0.0, raw_uN=0.0))
-    topic = json.loads(run("info", "a.mcap", "--json").stdout)["topics"]["f"]
-    assert (topic["missing"], topic["unsorted"]) == (2, 1)
+    found = json.loads(run("info", "a.mcap", "--json").stdout)
+    assert [(topic["missing"], topic["unsorted"]) for topic in found["topics"].values()] == [(2, 1), (0, 1)]
+    told = "missing: 2 samples of 'f', whose numbers are skipped"
+    assert (found["ended"], found["complete"], found["losses"]) == (True, False, [told])
+    shown = run("info", "a.mcap").stdout
+    assert f"  lost       {told}\n" in shown
+    assert "NOT COMPLETE" in shown.splitlines()[0]
     rates = [line.split()[3] for line in run("info", "a.mcap").stdout.splitlines() if "ForceSample" in line]
     assert rates == ["1e+06", "–"]
     assert "5 of 5 samples" in run("replay", "a.mcap", "--speed", 100).stdout
@@ -126,9 +131,10 @@ def test_times_out_of_order_and_dropped_samples_are_told_to_who_uses_them(run, o
         told = run(*command).stderr
         assert "out of order: 1 samples of 'stage'" in told
         assert "not recorded: 2 samples of 'zoom'" in told
-    run("analyse", "a.mcap", "--out", "t.csv")
+    told = run("analyse", "a.mcap", "--out", "t.csv")
     [row] = read_table(tmp_path / "t.csv")
-    assert (row["losses"], row["dropped"], row["unsorted"]) == ("0", "2", "1")
+    assert [row[name] for name in ("losses", "missing", "dropped", "unsorted", "doubtful")] == ["0", "0", "2", "1", "1"]
+    assert "1 recording, 1 with errors" in told.stdout  # a pose that is late by a second
 
 
 @pytest.mark.parametrize(
@@ -195,6 +201,26 @@ def test_a_calibration_that_is_none_of_the_last_zoom_is_no_success(run):
     assert "The run ended" in result.stdout
 
 
+def test_a_calibration_whose_recording_lacks_its_last_frames_is_no_success(run, optics_recording, tmp_path):
+    bus = Bus()
+    with (
+        Recording(optics_recording) as whole,
+        Recorder(
+            tmp_path / "run.mcap", bus=bus, clock=SimulatedClock(), header=RecordingHeader(source="recorded")
+        ) as recorder,
+    ):
+        samples = [(topic, sample) for topic, sample in whole.samples() if topic != "routine"]
+        recorder.follow_arrivals("optics", [sample.order for _, sample in samples])
+        for topic, sample in whole.samples():
+            if topic != "camera" or sample.seq < 25:
+                bus.topic(topic, type(sample)).publish(sample)
+    result = run("calibrate", "optics", "--replay", "run.mcap", "--out", "again")
+    assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (1, True), result.output
+    assert "the recording lacks its last 5 frames" in result.stdout
+    result = run("calibrate", "optics", "--replay", "run.mcap", "--frames", 20, "--out", "first")
+    assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (0, False), result.output
+
+
 def test_a_replay_never_writes_over_a_result(run, run_file, force_recording, tmp_path):
     for kind, source in (("optics", run_file), ("force", force_recording)):
         folder = tmp_path / kind
@@ -237,8 +263,8 @@ def test_two_recordings_in_one_file_and_two_writers_to_one(run, run_file, force_
     for name in ("joined", "mixed"):
         result = run("replay", f"{name}.mcap")
         assert result.exit_code == 0
-        assert "or something follows it" in result.stderr
-    assert "91 of 91 samples" in run("replay", "joined.mcap").stdout
+        assert ("something follows it" if name == "joined" else "something is damaged") in result.stderr
+    assert "92 of 92 samples" in run("replay", "joined.mcap").stdout
 
 
 def content(file):
@@ -275,7 +301,7 @@ def test_no_damage_is_silent_or_a_traceback(run, force_recording, tmp_path, seed
 def test_replay(run, run_file, monkeypatch):
     result = run("replay", run_file)
     assert result.exit_code == 0, result.output
-    assert "91 of 91 samples" in result.stdout
+    assert "92 of 92 samples" in result.stdout
     assert "× real time" in result.stdout
     assert run("replay", run_file, "--speed", "fast").exit_code == 2
 
@@ -284,7 +310,7 @@ def test_replay(run, run_file, monkeypatch):
 
     monkeypatch.setattr(RecordingPlayback, "run", interrupt)
     result = run("replay", run_file)
-    assert (result.exit_code, "0 of 91 samples" in result.stdout) == (130, True)
+    assert (result.exit_code, "0 of 92 samples" in result.stdout) == (130, True)
 
 
 def test_export_goes_beside_the_recording(run, run_file, tmp_path):
@@ -299,7 +325,9 @@ def test_export_goes_beside_the_recording(run, run_file, tmp_path):
 def test_analyse(run, run_file, tmp_path):
     result = run("analyse", ".", "--out", "t.csv")
     assert result.exit_code == 0, result.output
-    assert ": 1 recording, 0 with errors" in result.stdout
+    assert result.stdout == "t.csv: 1 recording, 0 with errors\n"
+    [row] = read_table(tmp_path / "t.csv")
+    assert (row["doubtful"], row["complete"], row["missing"]) == ("0", "1", "0")
     assert "never overwritten" in run("analyse", ".", "--out", "t.csv").stderr
 
 
@@ -339,21 +367,24 @@ def test_a_result_from_a_damaged_recording_says_so(run, optics_recording, force_
     assert "lost before the repair: a chunk is damaged" in (tmp_path / "repaired" / "result.json").read_text()
     run("analyse", "run.repaired.mcap", "--out", "t.csv")
     [row] = read_table(tmp_path / "t.csv")
-    assert row["losses"] == "1"
-    assert "1 recording, 0 with errors, 1 with losses" in run("analyse", "run.mcap", "--out", "t2.csv").stdout
+    assert (row["losses"], row["doubtful"]) == ("1", "1")
+    assert "with a flaw: lost before the repair: a chunk is damaged" in row["notes"]
+    told = run("analyse", "run.mcap", "--out", "t2.csv")
+    assert "1 recording, 0 with errors, 1 doubtful" in told.stdout
+    assert f"  run.mcap: doubtful: damaged or lost parts: 1, missing samples: {row['missing']}\n" in told.stderr
 
 
 def test_an_interrupted_characterisation_stays_one_when_it_is_replayed(run, force_recording, tmp_path):
-    def is_end(sample):
-        return getattr(sample, "kind", "") == "force/end"
+    def without(*kinds):
+        return lambda sample: [] if getattr(sample, "kind", "") in kinds else [sample]
 
     def interrupted(sample):
-        if not is_end(sample):
+        if getattr(sample, "kind", "") != "force/done":
             return [sample]
-        content = json.dumps({"ended_by": "it was interrupted"})
-        return [sample, msgspec.structs.replace(sample, kind="force/done", content=content, order=sample.order + 1)]
+        return [msgspec.structs.replace(sample, content=json.dumps({"ended_by": "it was interrupted"}))]
 
-    rewrite(force_recording, tmp_path / "broken_off.mcap", lambda sample: [] if is_end(sample) else [sample])
+    rewrite(force_recording, tmp_path / "broken_off.mcap", without("force/end", "force/done"))
+    rewrite(force_recording, tmp_path / "no_end.mcap", without("force/done"))
     rewrite(force_recording, tmp_path / "interrupted.mcap", interrupted)
     rewrite(force_recording, tmp_path / "whole.mcap")
     cut = (tmp_path / "whole.mcap").read_bytes()
@@ -361,6 +392,7 @@ def test_an_interrupted_characterisation_stays_one_when_it_is_replayed(run, forc
     for name, told in (
         ("broken_off", ["the recorded run ends before indentation 1 was over"]),
         ("cut", ["the recording was cut off, and ends before indentation 1 was over"]),
+        ("no_end", ["the recording does not hold its end"]),
         ("interrupted", ["it was interrupted"]),
         ("whole", []),
     ):

@@ -301,7 +301,7 @@ def test_damage_is_found_also_where_asserts_are_left_out(recorded, tmp_path):
 
 def test_log_times_that_run_backwards_are_told_by_a_repair(tmp_path):
     file = tmp_path / "rewritten.mcap"
-    with file.open("xb", buffering=0) as output:
+    with file.open("x+b", buffering=0) as output:
         writer = McapWriter(output, profile=PROFILE, library="another program")
         writer.add_metadata(HEADER_RECORD, to_metadata(RecordingHeader(source="fake")))
         key = ChannelKey("force", schema_name(ForceSample), schema_data(ForceSample))

@@ -71,10 +71,13 @@ def test_a_zoom_at_which_nothing_was_found_is_told(tmp_path):
         edit_cell(folder, row.line, "zoom", "1.5")
         cv2.imwrite(str(row.file), blank)
     result = calibrate(folder, tmp_path / "two")
-    assert result.exit_code == 0, result.output
-    notes = json.loads((tmp_path / "two" / "result.json").read_text())["notes"]
-    [told] = [note for note in notes if "The zoom changed" in note]
+    assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (1, True), result.output
+    found = json.loads((tmp_path / "two" / "result.json").read_text())
+    assert not found["complete"]
+    [told] = [note for note in found["notes"] if "The zoom changed" in note]
     assert "The zoom changed to 1.5, where no frame could be used: this is the calibration at zoom 1." in told
+    result = calibrate(folder, tmp_path / "three", "--frames", "20")
+    assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (0, False), result.output
 
 
 def test_comments_and_further_columns_are_allowed(sequence):

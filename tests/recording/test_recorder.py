@@ -156,7 +156,7 @@ class FullDisk:
     """A file on a disk with so much space, which may get more; a write that does not fit is done in part."""
 
     def __init__(self, file, space):
-        self._file = file.open("wb", buffering=0)
+        self._file = file.open("w+b", buffering=0)
         self.space = space
 
     def write(self, data):

@@ -4,11 +4,12 @@ import contextlib
 import json
 import re
 
+import msgspec
 import numpy as np
 import pytest
 
 from microdrivers.core.errors import ConfigError, DataError, LinkLost, SaturatedData
-from microdrivers.core.samples import RoutineNote
+from microdrivers.core.samples import ForceSample, RoutineNote
 from microdrivers.estimators.force.identify import identify
 from microdrivers.estimators.force.record import IndentationRecord
 from microdrivers.recording.indentation_table import IndentationTable
@@ -122,6 +123,31 @@ def test_pressed_and_valid_are_told_apart_where_the_specimen_slips(tmp_path):
     assert "x* of eq. (26)" in summary
 
 
+@pytest.mark.parametrize(("speed_um_s", "why"), [(5.0, ""), (2.0, "used up any part"), (2.9, "may have used up 1")])
+def test_a_slip_that_the_approach_has_used_up_in_part_is_not_quoted(tmp_path, speed_um_s, why):
+    record = recorded("slip_corrected")
+    file = tmp_path / "indentation.csv"
+    rows = zip(record.time_s, record.deformation_um, record.force_uN, strict=True)
+    file.write_text("time_s,indentation_um,force_uN\n" + "".join(f"{t},{x},{f}\n" for t, x, f in rows))
+    run = Characterisation(IndentationPlayback(IndentationTable(file))).run()
+    setup = run.setup._replace(speed_um_s=speed_um_s, touch_uN=1.0, touched_s=0.05)
+    slip = result_of(run._replace(setup=setup)).slip
+    assert slip.identifiable == (not why)
+    assert why in slip.reason
+    assert bool(slip.reason) == bool(why)
+
+
+def test_a_surface_that_lies_elsewhere_than_the_contact_that_was_felt_is_said(characterised):
+    _, run, result, _ = characterised
+    pressed = [
+        msgspec.structs.replace(sample, tip_um=sample.deformation_um + 31.0) for sample in run.first.deformations
+    ]
+    elsewhere = run._replace(first=run.first._replace(deformations=pressed))
+    assert not any("surface 31 µm" in note for note in [*result.notes, *result_of(elsewhere).notes])
+    live = result_of(elsewhere._replace(setup=run.setup._replace(touch_uN=1.0, touched_s=0.05)))
+    assert any("shows the surface 31 µm beyond where the approach felt a contact" in note for note in live.notes)
+
+
 def test_a_specimen_file_without_what_it_needs_is_refused(characterised, tmp_path):
     file = tmp_path / "specimen.yaml"
     characterised[2].write_specimen(file)
@@ -143,6 +169,23 @@ def test_what_was_measured_is_kept_when_it_ends_with_an_error():
         characterisation.run()
     assert len(characterisation.first.samples) > 190
     assert source.finished == 1
+
+
+def test_a_force_that_came_between_two_frames_is_said():
+    class Hits(MadeUpSource):
+        def indent(self, begin, progress):
+            try:
+                super().indent(begin, progress)
+            finally:
+                hit = ForceSample(t_ns=self._now_ns + 1_000_000, device="force", seq=999, force_uN=302.0, raw_uN=302.0)
+                self.bus.topic("force", ForceSample).publish(hit)
+
+    error = LinkLost("stopped by the guard")
+    characterisation = Characterisation(Hits(broken_off_at=60, error=error))
+    with pytest.raises(LinkLost):
+        characterisation.run()
+    assert characterisation.partial(error) is None
+    assert re.match(r"up to 302 µN was felt, but .* none of the \d+ frames", characterisation.tells_nothing)
 
 
 def test_an_interruption_identifies_what_there_is():

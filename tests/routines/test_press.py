@@ -19,6 +19,7 @@ from microdrivers.core.errors import (
     UnsafeError,
 )
 from microdrivers.core.units import NS_PER_S, Range
+from microdrivers.devices.force_sensor import Tare
 from microdrivers.estimators.vision.contact_patch import contact_patch
 from microdrivers.rig import open_rig
 from microdrivers.rig.safety_keep_out import KeepOut
@@ -209,6 +210,26 @@ def test_a_limit_that_ends_the_press_at_once_is_named(rig):
     assert re.match(r"the force leaves its noise in only \d+ of \d+ frames, by up to ", characterisation.tells_nothing)
 
 
+def test_a_noisy_sensor_is_tared_so_long_that_a_drift_shows(rig, monkeypatch):
+    sensor, taken_s = rig.devices["probe_force"], []
+    monkeypatch.setattr(sensor, "tare", lambda duration_s: taken_s.append(duration_s) or noisy)
+    noisy = Tare(t_ns=0, offset_uN=0.0, sigma_uN=2.0, n=40)
+    experiment = PressExperiment(rig, SHORT)
+    experiment._tare()
+    assert taken_s == [SHORT.tare_s, pytest.approx(2.05, abs=0.1)]
+    taken_s.clear()
+    noisy = Tare(t_ns=0, offset_uN=0.0, sigma_uN=0.05, n=40)
+    experiment._tare()
+    assert taken_s == [SHORT.tare_s]
+
+
+def test_a_limit_that_noise_hides_a_touch_from_is_refused(rig):
+    _, error = run(rig, SHORT._replace(max_force_uN=1.5))
+    assert isinstance(error, OutOfRange)
+    assert "a touch shows from 1 µN on in the noise of probe_force, which is not clear of the 1.5 µN" in error.what
+    assert "--max-force-uN" in error.remedy
+
+
 def test_the_speed_that_a_guard_allows_is_kept_on_free_ways(rig, monkeypatch):
     monkeypatch.setattr(type(rig.safety), "max_speed_um_s", lambda _self, _sensor: 300.0)
     speeds_um_s = []
@@ -297,3 +318,43 @@ def test_a_picture_in_which_nothing_moves_asks_for_tip_and_specimen(rig):
     with pytest.raises(DataError, match="nothing in the picture moved while the probe travelled 100 µm") as caught:
         sight.Sight().learn(frames, [20.0 * k for k in range(6)], scale_hint_px_per_um=0.25)
     assert "specimen" in caught.value.remedy
+
+
+def test_a_force_that_stays_when_the_tool_goes_back_is_no_contact(rig):
+    """Something else than the specimen bends the sensor: tared anew, and the specimen is found farther on."""
+    world, told = rig.simulation.world, []
+
+    def step(text):
+        told.append(text)
+        if text.startswith("approach until contact"):
+            since_ns = rig.clock.now_ns() + round(0.4 * NS_PER_S)
+            world.pressed["probe_force"] = lambda t_ns: 30.0 if t_ns > since_ns else 0.0
+        elif text.startswith("no contact after"):
+            world.pressed.clear()
+
+    steps = SilentProgress()
+    steps.step = step
+    characterisation, error = run(rig, steps=steps)
+    assert error is None
+    alarm, contact = (next(text for text in told if text.startswith(begin)) for begin in ("no contact", "contact"))
+    assert "it is the sensor's drift; tare, and on" in alarm
+    alarm_um, contact_um = (float(re.search(r"after ([\d.]+) µm", text)[1]) for text in (alarm, contact))
+    assert alarm_um < contact_um - 10.0
+    assert max(sample.force_uN for sample in characterisation.first.samples) > 150.0
+
+
+def test_false_contacts_that_come_no_farther_are_given_up(rig):
+    """Each tare is followed by a force that begins at once: where the specimen is cannot be told."""
+    world = rig.simulation.world
+
+    def bend(_text=None):
+        since_ns = rig.clock.now_ns() + round(0.35 * NS_PER_S)
+        world.pressed["probe_force"] = lambda t_ns: 30.0 if t_ns > since_ns else 0.0
+
+    steps = SilentProgress()
+    steps.step = lambda text: bend() if text.startswith(("approach until", "no contact after")) else None
+    _, error = run(rig, steps=steps)
+    assert isinstance(error, DataError)
+    assert not isinstance(error, NoContact)
+    assert "the sensor's zero drifts too fast to find the specimen" in error.what
+    assert probe_um(rig) > -410.0 + AWAY_UM

@@ -116,7 +116,7 @@ class Press:
         self.rig.simulation.world.pressed.clear()
         self.zero_uN = 0.0
         self.clock.sleep(1.0)
-        self.experiment._drive.go(self.experiment._contact_um - SHORT.back_off_um)
+        self.experiment._drive.go(self.experiment._contact.place_um - SHORT.back_off_um)
 
 
 def rig_file(folder, **changes):

@@ -126,6 +126,74 @@ def test_frames_that_a_recording_lacks_are_lost_and_no_later_one_takes_their_pla
     assert (f"among them {60 - used} frame" in result.notes[0]) == (used < 60)
 
 
+def without(file, copy, is_it):
+    """A recording that is whole by all that it says, and lacks such samples."""
+    bus, clock = Bus(), SimulatedClock()
+    with (
+        Recording(file) as recording,
+        Recorder(copy, bus=bus, clock=clock, header=describe_recording(source="fake")) as recorder,
+    ):
+        for host, orders in recording.arrivals.items():
+            recorder.follow_arrivals(host, orders)
+        for topic, sample in recording.samples(leave_out=("truth/*",)):
+            if not is_it(sample):
+                bus.topic(topic, type(sample)).publish(sample)
+    return copy
+
+
+def test_a_calibration_of_which_all_is_there_is_analysed_as_it_was_set_and_not_doubted(calibrated):
+    run, file = calibrated
+    provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
+    live, row = build_optics_result(run, provenance), analyse_recording(str(file))
+    figures = ("scale_px_per_um", "scale_sigma_px_per_um", "angle_deg", "angle_sigma_deg", "zoom", "frames")
+    assert [row[name] for name in figures] == [getattr(live, name) for name in figures]
+    counts = ("losses", "missing", "dropped", "unsorted", "lost_frames")
+    assert [row[name] for name in ("doubtful", "complete", *counts)] == [False, True, *[0] * len(counts)]
+
+
+def test_a_calibration_that_lacks_its_last_frames_is_doubtful(calibrated, tmp_path):
+    run, file = calibrated
+    last_ns = run.estimates[24].t_ns
+    copy = without(file, tmp_path / "run.mcap", lambda sample: isinstance(sample, Frame) and sample.t_ns > last_ns)
+    row = analyse_recording(str(copy))
+    figures = ("doubtful", "complete", "frames", "lost_frames", "losses")
+    assert [row[name] for name in figures] == [True, False, 25, 35, 0]
+    assert row["missing"] >= 35
+    assert "The recorded run is not whole: the recording lacks its last 35 frames." in row["notes"]
+    assert "35 frames of the experiment" in row["notes"]
+    assert "The zoom changed to 1.2, where no frame could be used: this is the calibration at zoom 0.8" in row["notes"]
+
+
+def test_a_calibration_at_another_zoom_than_the_recorded_run_had_is_not_complete(calibrated, tmp_path):
+    run, file = calibrated
+    first_ns, last_ns = run.estimates[24].t_ns, run.estimates[-2].t_ns
+    copy = without(file, tmp_path / "run.mcap", lambda s: isinstance(s, Frame) and first_ns < s.t_ns <= last_ns)
+    row = analyse_recording(str(copy))
+    assert [row[name] for name in ("doubtful", "complete", "losses")] == [True, False, 0]
+    assert (row["missing"], row["frames"] + row["lost_frames"]) == (34, 60)
+    assert "this is the calibration at zoom 0.8999" in row["notes"]
+
+
+def test_poses_that_a_recording_lacks_make_its_figures_doubtful(calibrated, tmp_path):
+    run, file = calibrated
+    first_ns = run.estimates[40].t_ns
+    copy = without(
+        file, tmp_path / "run.mcap", lambda s: isinstance(s, XYThetaSample) and 0 < s.t_ns - first_ns < 200_000_000
+    )
+    row = analyse_recording(str(copy))
+    assert [row[name] for name in ("doubtful", "complete", "losses", "dropped")] == [True, True, 0, 0]
+    assert row["missing"] > 10
+    assert f"it lacks {row['missing']} samples that the estimators had" in row["notes"]
+    assert f"missing: {row['missing']} samples of 'sample_stage', whose numbers are skipped" in row["notes"]
+
+
+def test_a_calibration_whose_end_is_not_recorded_is_not_complete(calibrated, tmp_path):
+    copy = without(calibrated[1], tmp_path / "run.mcap", lambda sample: getattr(sample, "kind", "") == "optics/done")
+    row = analyse_recording(str(copy))
+    assert [row[name] for name in ("doubtful", "complete", "frames", "missing")] == [True, False, 60, 0]
+    assert "The recorded run is not whole: the recording does not hold its end." in row["notes"]
+
+
 def test_a_calibration_whose_beginning_is_damaged_is_called_so(calibrated, tmp_path):
     for named in ("optics/begin", "optics/"):
         copy = damaged(calibrated[1], tmp_path / "run.mcap", lambda s, n=named: getattr(s, "kind", "").startswith(n))
@@ -153,7 +221,7 @@ def test_an_interrupted_calibration_stays_one_when_it_is_replayed(tmp_path):
         assert recording.complete
         result = build_optics_result(calibrate_optics(OpticsReplay(recording)), provenance)
     assert not result.complete
-    assert result.notes[0].startswith("The recorded run ended early: it was interrupted.")
+    assert result.notes[0].startswith("The recorded run is not whole: it was interrupted.")
 
 
 def test_the_estimator_sees_what_it_saw(calibrated):
@@ -305,7 +373,10 @@ def test_a_recorded_characterisation_gives_the_same_bits(indented):
         assert bits(after.forces) == bits(before.forces)
         assert after.arrivals == before.arrivals
     provenance = describe_run({"source": "test", "clock": "recorded"}, command="test", now=utc_now())
-    assert build_result(again, provenance) == build_result(run, provenance)
+    live, row = build_result(run, provenance), analyse_recording(str(file))
+    assert build_result(again, provenance) == live
+    assert (row["protocol"], row["k1_uN_per_um"]) == (live.best, live.protocols[live.best].k1_uN_per_um)
+    assert [row[name] for name in ("error", "doubtful", "complete", "missing")] == [None, False, True, 0]
 
 
 @pytest.mark.xdist_group("recorded_press")

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from microdrivers.core.errors import ConfigError
 from microdrivers.recording.views import optional_module
-from microdrivers.routines.analysis.one import COLUMNS, Row, analyse_recording
+from microdrivers.routines.analysis.one import Row, analyse_recording, failed_row
 from microdrivers.routines.analysis.results_table import ResultsTable
 
 _THREAD_LIMITS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -37,9 +37,9 @@ class BatchReport(NamedTuple):
     failed: int
 
     @property
-    def incomplete(self) -> int:
-        """Of how many recordings that were analysed something is lost."""
-        return sum(row["error"] is None and bool(row["losses"] or row["dropped"]) for row in self.rows)
+    def doubtful(self) -> list[Row]:
+        """Rows without an error whose figures are not to be trusted without a second look."""
+        return [row for row in self.rows if row["doubtful"] and row["error"] is None]
 
 
 def find_recordings(runs: Sequence[Path]) -> list[str]:
@@ -134,7 +134,7 @@ def _in_processes(files: Sequence[str], jobs: int, analyse: Analyse) -> Iterator
         suspects = yield from _with_pool(waiting, jobs, analyse)
         for file in suspects:
             if (yield from _with_pool([file], 1, analyse)):
-                yield dict.fromkeys(COLUMNS) | {"file": file, "error": "the process that analysed it was killed"}
+                yield failed_row(file, "the process that analysed it was killed")
 
 
 def _with_pool(waiting: list[str], jobs: int, analyse: Analyse) -> Generator[Row, None, list[str]]:
@@ -223,5 +223,5 @@ def _on_cluster(files: Sequence[str], address: str, analyse: Analyse) -> Iterato
                 yield future.result()
             else:
                 why = f"the cluster has given it up: {future.exception()}".splitlines()[0]
-                yield dict.fromkeys(COLUMNS) | {"file": futures[future], "error": why}
+                yield failed_row(futures[future], why)
             future.release()

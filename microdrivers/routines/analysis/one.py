@@ -15,13 +15,15 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import notes_of
 from microdrivers.results.force import ForceResult
 from microdrivers.results.optics import OpticsResult
+from microdrivers.routines.past_run import PastRun
 
 Row = dict[str, str | int | float | bool | None]
 """A cell for each of `COLUMNS`; None where a figure is undefined."""
 
 COLUMNS: Mapping[str, type] = {
-    "file": str, "kind": str, "error": str, "losses": int, "dropped": int, "unsorted": int,
-    "created_utc": str, "rig": str, "seed": int, "complete": bool,
+    "file": str, "kind": str, "error": str, "doubtful": bool,
+    "complete": bool, "losses": int, "missing": int, "dropped": int, "unsorted": int,
+    "created_utc": str, "rig": str, "seed": int,
     "frames": int, "lost_frames": int, "unmatched_frames": int,
     "scale_px_per_um": float, "scale_sigma_px_per_um": float, "zoom": float, "magnification": float,
     "angle_deg": float, "angle_sigma_deg": float, "tilt_low_deg": float, "tilt_high_deg": float, "view": str,
@@ -30,9 +32,20 @@ COLUMNS: Mapping[str, type] = {
     "k2_sigma_uN_per_um3": float, "b_uN_s_per_um": float, "b_sigma_uN_s_per_um": float, "fit_error_percent": float,
     "misfit": bool, "vision_force_error_percent": float, "deepest_um": float, "largest_force_uN": float,
     "true_scale_error_percent": float, "true_angle_error_deg": float, "true_k1_error_percent": float,
-    "true_k2_error_percent": float, "true_b_error_percent": float,
+    "true_k2_error_percent": float, "true_b_error_percent": float, "notes": str,
 }  # fmt: skip
-"""Columns of the table and what they hold. `true_…` is against the truth of a simulation."""
+"""Columns of the table and what they hold.
+
+`doubtful` marks a row with an `error` or with `doubts`: the run is not `complete`, or something of its recording is
+damaged or lost (`losses`, `dropped`, `missing`) or out of order (`unsorted`). `missing` counts samples that the file
+lacks: those that the estimators had, or whose numbers are skipped. `notes` are those of the result. `true_…` is against
+the truth of a simulation.
+"""
+
+_FLAWS = {
+    "losses": "damaged or lost parts", "missing": "missing samples", "dropped": "dropped samples",
+    "unsorted": "samples out of order",
+}  # fmt: skip
 
 
 def analyse_recording(file: str) -> Row:
@@ -40,20 +53,32 @@ def analyse_recording(file: str) -> Row:
 
     Whatever is wrong with the file stands in the row's `error`; never raises for a bad file.
     """
-    row: Row = dict.fromkeys(COLUMNS)
-    row["file"] = file
+    row: Row = dict.fromkeys(COLUMNS) | {"file": file}
     try:
         with _one_thread(), Recording(Path(file)) as recording:
             row |= _origin(recording.header)
-            row["losses"] = len(recording.losses)
-            row["dropped"] = sum(topic.dropped for topic in recording.topics.values())
-            row["unsorted"] = sum(topic.unsorted for topic in recording.topics.values())
-            row |= _analyse(recording)
+            topics = recording.topics.values()
+            skipped = sum(topic.gaps for topic in topics)
+            row |= {"losses": len(recording.losses), "missing": skipped}
+            row |= {name: sum(getattr(topic, name) for topic in topics) for name in ("dropped", "unsorted")}
+            found, past_run = _analyse(recording)
+            row |= found | {"missing": max(skipped, past_run.missing)}
     except MicrodriversError as error:
         row["error"] = f"{type(error).__name__}: {str(error).splitlines()[0]}"
     except Exception as error:  # noqa: BLE001 - one bad file must not end the batch; the row tells what happened
         row["error"] = f"{type(error).__name__}: {error}".splitlines()[0]
-    return row
+    return row | {"doubtful": bool(row["error"] or doubts(row))}
+
+
+def failed_row(file: str, error: str) -> Row:
+    """The row of a recording of which nothing is known but why it was not analysed."""
+    return dict.fromkeys(COLUMNS) | {"file": file, "error": error, "doubtful": True}
+
+
+def doubts(row: Row) -> list[str]:
+    """Why the figures of a row are not to be trusted without a second look; empty if nothing speaks against it."""
+    flaws = [f"{what}: {row[name]}" for name, what in _FLAWS.items() if row[name]]
+    return flaws if row["complete"] else ["not complete", *flaws]
 
 
 @contextmanager
@@ -73,14 +98,16 @@ def _origin(header: RecordingHeader) -> Row:
     return {"created_utc": header.created_utc or None, "rig": header.rig or None, "seed": header.seed}
 
 
-def _analyse(recording: Recording) -> Row:
+def _analyse(recording: Recording) -> tuple[Row, PastRun]:
     # Where all notes are in what is damaged, the inbox of its estimator still tells what it was.
     names = (*(note.kind for note in notes_of(recording)), *recording.arrivals)
     kinds = {name.partition("/")[0] for name in names}
     if "optics" in kinds:
-        return _optics_row(analyse_optics(recording))
+        optics, past_run = analyse_optics(recording)
+        return _row_of(optics) | _optics_row(optics), past_run
     if "force" in kinds:
-        return _force_row(analyse_force(recording))
+        force, past_run = analyse_force(recording)
+        return _row_of(force) | _force_row(force), past_run
     raise UnsupportedError(
         f"{recording.file} holds no analysis that could be run again",
         remedy="give recordings of `microdrivers calibrate optics` or `calibrate force`",
@@ -93,8 +120,8 @@ def _known(recording: Recording) -> dict[str, Any]:
     return known | {"source": f"recording {recording.file}", "clock": "recorded"}
 
 
-def analyse_optics(recording: Recording) -> OpticsResult:
-    """The optical calibration of a recording, estimated anew.
+def analyse_optics(recording: Recording) -> tuple[OpticsResult, PastRun]:
+    """The optical calibration of a recording, estimated anew as it was set, and what is told of its run.
 
     Raises:
         UnsupportedError: it holds none, or lacks what its estimator needs. IllConditioned: it determines none.
@@ -112,11 +139,11 @@ def analyse_optics(recording: Recording) -> OpticsResult:
             f"{recording.file} gave its estimator nothing", remedy="record the topics of stage, zoom and camera"
         )
     result = build_result(run, describe_run(_known(recording), command="analyse", now=utc_now()))
-    return result.model_copy(update={"truth": truth.compare(result, run.estimates)})
+    return result.model_copy(update={"truth": truth.compare(result, run.estimates)}), run.past_run
 
 
-def analyse_force(recording: Recording) -> ForceResult:
-    """The force characterisation of a recording, identified anew.
+def analyse_force(recording: Recording) -> tuple[ForceResult, PastRun]:
+    """The force characterisation of a recording, identified anew as it was set, and what is told of its run.
 
     Raises:
         UnsupportedError: it holds none, or lacks what its estimators need. NoContact, IllConditioned and other
@@ -130,7 +157,11 @@ def analyse_force(recording: Recording) -> ForceResult:
     truth = ContactTruthCollector(source.bus)
     run = Characterisation(source).run()
     result = build_result(run, describe_run(_known(recording), command="analyse", now=utc_now()))
-    return result.model_copy(update={"truth": truth.compare(result, run.first.deformations)})
+    return result.model_copy(update={"truth": truth.compare(result, run.first.deformations)}), run.past_run
+
+
+def _row_of(result: OpticsResult | ForceResult) -> Row:
+    return {"kind": result.kind, "complete": result.complete, "notes": " ".join(result.notes) or None}
 
 
 def _optics_row(result: OpticsResult) -> Row:
@@ -138,7 +169,7 @@ def _optics_row(result: OpticsResult) -> Row:
 
     settled, change, truth = settled_error(result), result.zoom_change, result.truth
     row: Row = {
-        "kind": result.kind, "complete": result.complete, "frames": result.frames, "lost_frames": result.lost_frames,
+        "frames": result.frames, "lost_frames": result.lost_frames,
         "unmatched_frames": result.unmatched_frames, "scale_px_per_um": result.scale_px_per_um,
         "scale_sigma_px_per_um": result.scale_sigma_px_per_um, "zoom": result.zoom,
         "magnification": result.magnification, "angle_deg": result.angle_deg,
@@ -158,7 +189,7 @@ def _optics_row(result: OpticsResult) -> Row:
 def _force_row(result: ForceResult) -> Row:
     best = result.protocols[result.best]
     row: Row = {
-        "kind": result.kind, "complete": result.complete, "frames": len(result.traces.time_s),
+        "frames": len(result.traces.time_s),
         "protocol": result.best, "k1_uN_per_um": best.k1_uN_per_um, "k1_sigma_uN_per_um": best.k1_sigma_uN_per_um,
         "k2_uN_per_um3": best.k2_uN_per_um3, "k2_sigma_uN_per_um3": best.k2_sigma_uN_per_um3,
         "b_uN_s_per_um": best.b_uN_s_per_um, "b_sigma_uN_s_per_um": best.b_sigma_uN_s_per_um,

@@ -138,10 +138,13 @@ class ResultsTable:
                 self.journal.unlink(missing_ok=True)
                 raise
             return
-        if _parsed(lines[0]) != begin:
+        found = _parsed(lines[0])
+        if found != begin:
+            is_other = isinstance(found, dict) and found.get("journal") == begin["journal"]
             raise ConfigError(
-                "this is no journal of this version of microdrivers", file=str(self.journal),
-                remedy="remove it to begin anew, or choose another --out",
+                "this table was begun by another version of microdrivers, whose rows may differ" if is_other
+                else "this is not a journal of `microdrivers analyse`",
+                file=str(self.journal), remedy="remove it to begin anew, or choose another --out",
             )  # fmt: skip
         for line in lines[1:]:
             entry = _parsed(line)

@@ -47,6 +47,7 @@ class Indentation(NamedTuple):
         frames: all frames in order of time, those without a deformation or a force flagged with the reason; the
             picture's drift is taken off.
         drift: of the picture; None if it is not known.
+        felt_uN: how far single readings, between the frames, too, were off the usual force; 0 within their noise.
         deformations: one a frame. estimates: of the recursion. forces: read from the camera.
         arrivals: bus-wide order numbers in the order in which the estimators saw the samples. recorded: these samples,
             if asked for.
@@ -56,6 +57,7 @@ class Indentation(NamedTuple):
     unmatched: Counter[str]
     frames: list[IndentationSample]
     drift: ImageDrift | None
+    felt_uN: float
     deformations: list[DeformationSample]
     estimates: list[SpecimenEstimate]
     forces: list[VisionForceSample]
@@ -167,12 +169,23 @@ class Characterisation:
         except NoContact as error:
             felt_uN = in_contact_uN(frames)
             if not felt_uN:
-                raise
+                raise self._between_frames(frames) or error from error
             raise DataError(
                 f"the force leaves its noise in only {len(felt_uN)} of {len(frames)} frames, by up to "
                 f"{max(felt_uN):.4g} µN",
                 remedy="press more slowly or deeper, so that more frames see the specimen pressed",
             ) from error
+
+    def _between_frames(self, frames: list[IndentationSample]) -> DataError | None:
+        """What to say where the sensor felt what no frame saw; None if it did not."""
+        felt_uN = 0.0 if self.first is None else self.first.felt_uN
+        if felt_uN == 0.0:
+            return None
+        return DataError(
+            f"up to {felt_uN:.4g} µN was felt, but so briefly that none of the {len(frames)} frames shows the specimen "
+            "pressed",
+            remedy="press more slowly, so that frames see the specimen pressed",
+        )
 
     def _indent(self, tracker: FrameTracker | None, model: SpecimenModel | None, progress: Progress) -> None:
         """One indentation: `first` or, with a model of the specimen, `check`; kept whatever ends it."""
@@ -227,10 +240,12 @@ class _Session:
             VisionForceSample: bus.topic("estimate/force", VisionForceSample),
         }
         frames = bus.topic(names.camera, Frame) if names.camera is not None else deformations
-        self._inputs: tuple[Topic[Any], ...] = (bus.topic(names.sensor, ForceSample), frames)
+        readings = bus.topic(names.sensor, ForceSample)
+        self._inputs: tuple[Topic[Any], ...] = (readings, frames)
         self._found: list[Sample] = []
+        self._felt: list[ForceSample] = []
         self._seen: list[DeformationSample] = []
-        self._watch = deformations.subscribe(self._seen.append)
+        self._watches = (deformations.subscribe(self._seen.append), readings.subscribe(self._felt.append))
 
     def begin(self) -> None:
         """What follows belongs to the indentation."""
@@ -245,7 +260,8 @@ class _Session:
             self._host.close()
         for sample in self._estimator.finish():
             self._publish(sample)
-        self._watch.cancel()
+        for watch in self._watches:
+            watch.cancel()
         matched = [sample for sample in self._found if isinstance(sample, IndentationSample)]
         matcher, drift = self._estimator.matcher, drift_of(self._seen, matched, rests)
         return Indentation(
@@ -253,6 +269,7 @@ class _Session:
             unmatched=matcher.unmatched,
             frames=without_drift(all_frames(matched, self._seen, matcher.given_up), drift),
             drift=drift,
+            felt_uN=max(in_contact_uN(self._felt), default=0.0),
             deformations=self._seen,
             estimates=[sample for sample in self._found if isinstance(sample, SpecimenEstimate)],
             forces=[sample for sample in self._found if isinstance(sample, VisionForceSample)],

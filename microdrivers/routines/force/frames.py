@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from microdrivers.core.contact_samples import DeformationSample, IndentationSample
+from microdrivers.core.samples import ForceSample
 from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.force_sensor import SATURATED
 from microdrivers.estimators.force.matcher import GivenUp
@@ -77,9 +78,9 @@ def drift_of(
     )
 
 
-def in_contact_uN(frames: Iterable[IndentationSample]) -> list[float]:
-    """How far the force is off its usual value in those frames where it clearly is; most frames are of a free tool."""
-    known = np.array([frame.force_uN for frame in frames if math.isfinite(frame.force_uN)])
+def in_contact_uN(samples: Iterable[IndentationSample | ForceSample]) -> list[float]:
+    """How far the force is off its usual value in those samples where it clearly is; most are of a free tool."""
+    known = np.array([sample.force_uN for sample in samples if math.isfinite(sample.force_uN)])
     if not len(known):
         return []
     off = np.abs(known - np.median(known))

@@ -8,13 +8,13 @@ from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample
-from microdrivers.core.errors import ConfigError, NoContact, NotReferenced
+from microdrivers.core.errors import ConfigError, NotReferenced
 from microdrivers.core.samples import Frame
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.fine_stage import FineStage
-from microdrivers.devices.force_sensor import ForceSensor, Tare
+from microdrivers.devices.force_sensor import TARE_DURATIONS_S, ForceSensor, Tare
 from microdrivers.rig import Rig
-from microdrivers.routines.force.frames import TOUCHES_UN
+from microdrivers.routines.force.approach import Contact, find_specimen, tare_s
 from microdrivers.routines.force.press_checks import check_press
 from microdrivers.routines.force.press_settings import PressSettings
 from microdrivers.routines.force.probe_drive import ProbeDrive
@@ -36,9 +36,6 @@ from microdrivers.routines.progress import Progress
 
 _AFTER_S = 0.5
 """How long samples come of the probe at rest, before and after an indentation: they show how the picture drifts."""
-
-_CONTACT_SIGMAS, _CONTACT_READINGS = 8.0, 3
-"""It is contact if so many readings in a row exceed so many standard deviations of the tare, and TOUCHES_UN."""
 
 _REST_FRAMES = 10
 """Of the undeformed specimen, from which is chosen what is tracked."""
@@ -81,7 +78,7 @@ class PressExperiment:
         self._ready_um = None if ready_um is None else dict(zip(self._stage.axis_names, ready_um, strict=True))
         check_press(rig, self._stage, self._sensor, self.settings, self._ready_um)
         self._drive: ProbeDrive | None = None
-        self._contact_um = math.nan
+        self._contact: Contact | None = None
         self._near = False
         self._indented = False
         self._watcher: FrameTracker | None = None
@@ -108,12 +105,14 @@ class PressExperiment:
         self._sight.learn(*travel[:2], scale_hint_px_per_um=travel.scale_hint_px_per_um)
         progress.step("approach until contact")
         self._near = True
-        self._contact_um = self._approach(drive)
-        progress.step(f"contact after {self._contact_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
-        drive.go(self._contact_um - self.settings.back_off_um)
+        self._contact = contact = find_specimen(
+            drive, self._sensor, self.settings, limit_uN=self._limit_at(self._sensor.tared), retare=self._tare,
+            clock=self.clock, progress=progress,
+        )  # fmt: skip
+        progress.step(f"contact after {contact.place_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
         self.clock.sleep(self.settings.rest_s)
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
-        ahead_um = self._contact_um - drive.place_um
+        ahead_um = contact.place_um - drive.place_um
         # Two: what is seen between indentations must not change what is seen in them.
         tracker, self._watcher = (
             self._sight.tracker(self._camera.name, rest, contact_ahead_um=ahead_um, depth_um=self.settings.depth_um)
@@ -155,8 +154,11 @@ class PressExperiment:
             )
 
     def _tare(self) -> None:
-        """Take the sensor's zero, which must leave the force that is asked for."""
-        self._limit_at(self._sensor.tare(self.settings.tare_s))
+        """Take the sensor's zero, longer where noise hides a drift; it must leave the force that is asked for."""
+        tare = self._sensor.tare(self.settings.tare_s)
+        if (longer_s := min(tare_s(self._sensor, tare), TARE_DURATIONS_S.max)) > self.settings.tare_s:
+            tare = self._sensor.tare(longer_s)
+        self._limit_at(tare)
 
     def _limit_at(self, tare: Tare | None) -> float:
         """Where pressing ends by itself at a zero of the sensor.
@@ -187,36 +189,15 @@ class PressExperiment:
         lens = 1.0 if microscope is None else microscope.objective * microscope.adapter
         return lens * (zoom or 1.0) / (self._camera.pixel_pitch_um * self._camera.settings.binning)
 
-    def _approach(self, drive: ProbeDrive) -> float:
-        """Go on until the sensor feels the specimen; returns where that was."""
-        tare = self._sensor.tared
-        threshold_uN = max(TOUCHES_UN, _CONTACT_SIGMAS * (tare.sigma_uN if tare is not None else 0.0))
-        felt = Felt(threshold_uN, _CONTACT_READINGS)
-        end_um = self.settings.approach_um(drive.way.longest_um())
-        with drive.readings(felt):
-            reached = drive.run(end_um, lambda: felt.enough)
-        felt.raise_if_saturated("on the approach", sensor=self._sensor.name)
-        if not felt.enough:
-            raise NoContact(
-                f"no contact within {end_um:.0f} µm: the force stayed within ±{threshold_uN:.2g} µN",
-                device=self._sensor.name,
-                remedy="align the probe with the specimen, nearer to it; check the sensor's axis in the rig file",
-                moved="yes",
-            )
-        if felt.force_uN < 0.0:
-            raise ConfigError(
-                f"{self._sensor.name} read {felt.force_uN:.3g} µN on contact, which must be positive",
-                remedy="turn its axis round in the rig file, or take the probe out of what it sticks to",
-            )
-        return reached
-
     # ------------------------------------------------------------------ one indentation
 
     def indent(self, begin: Callable[[], None], progress: Progress) -> Rests:
         """Press to the depth or to the force limit, and come back at the same speed."""
         assert self._drive is not None
+        assert self._contact is not None
         drive, asked, limit_uN = self._drive, self.settings, self._limit_at(self._sensor.tared)
-        start_um, end_um = self._contact_um - asked.back_off_um, self._contact_um + asked.depth_um
+        contact_um = self._contact.place_um
+        start_um, end_um = contact_um - asked.back_off_um, contact_um + asked.depth_um
         drive.go(start_um)
         if self._indented:
             self._let_recover(progress)
@@ -249,7 +230,7 @@ class PressExperiment:
             # A place read at rest is off by up to half a step, either time.
             rests = Rests(until_ns, since_ns, back_um - rested_um, drive.way.step_um / math.sqrt(6.0))
             note(self.bus, self.clock, END, rests._asdict())
-        pressed_um = deepest_um - self._contact_um
+        pressed_um = deepest_um - contact_um
         felt.raise_if_too_soon(pressed_um, speed_um_s=asked.speed_um_s, sensor=self._sensor.name)
         return rests
 
@@ -292,8 +273,9 @@ class PressExperiment:
             self._near = False
         position = self._stage.read().position
         where = ", ".join(f"{axis} {um:.1f} µm" for axis, um in position.items())
-        before_um = self._contact_um - self._drive.way.place_um(position)
-        contact = "no contact was felt" if math.isnan(before_um) else f"{before_um:.0f} µm before the contact"
+        contact = "no contact was felt"
+        if self._contact is not None:
+            contact = f"{self._contact.place_um - self._drive.way.place_um(position):.0f} µm before the contact"
         self.whereabouts = f"{self._stage.name} stands at {where}; {contact}"
 
     def setup(self) -> IndentationSetup:
@@ -305,6 +287,8 @@ class PressExperiment:
             scale_sigma_px_per_um=self._sight.scale_sigma_px_per_um, zoom=zoom_of(self._rig),
             speed_um_s=self.settings.speed_um_s, tare_uN=None if tare is None else tare.offset_uN,
             guarded=self._guarded,
+            touch_uN=None if self._contact is None else self._contact.touch_uN,
+            touched_s=None if self._contact is None else self._contact.pressed_s,
         )  # fmt: skip
 
 

@@ -31,12 +31,19 @@ from microdrivers.results.record import Provenance, Trace
 from microdrivers.routines.force.characterisation import ForceRun, Indentation
 from microdrivers.routines.force.frames import TOUCHES_UN
 from microdrivers.routines.force.source import IndentationSetup
+from microdrivers.routines.force.touch_checks import slip_used_up_um, surface_ahead_um
 
 Array = npt.NDArray[np.float64]
 
 _FEWEST_IN_CONTACT = 10
 _CAME_BACK = 0.5
 """Of the deepest: an indentation that ends above it had no reversal yet, as far as is known."""
+
+_USED_UP = 0.03
+"""Of a slip: more than this, used up by the approach, and what is found is not the specimen's own."""
+
+_SURFACE_UM = 3.0
+"""Farther than this from where the approach felt a contact, the surface lies elsewhere."""
 
 _LEFT = 0.5
 """Of the camera's force: what the sensor feels less than, of a specimen that has been let go."""
@@ -155,14 +162,31 @@ def _slip(run: ForceRun) -> SlipFit | None:
         return None
     drifted_um = 0.0 if drift is None else drift.sigma_um_s * found.contact_duration_s
     scaled_um = _relative_scale_sigma(run.setup) * slip.offset_um
+    used_up = _used_up(run)
     return SlipFit(
         offset_um=slip.offset_um,
         offset_sigma_um=_known(math.hypot(slip.sigma_offset_um, drifted_um, scaled_um)),
         rate_per_s=slip.rate_per_s,
         rate_sigma_per_s=_known(slip.sigma_rate_per_s),
         not_returned_um=slip.not_returned_um,
-        identifiable=slip.identifiable,
-        reason=slip.reason,
+        identifiable=slip.identifiable and not used_up,
+        reason="; ".join(filter(None, (slip.reason, used_up))),
+    )
+
+
+def _used_up(run: ForceRun) -> str:
+    """Why the slip that was found is only what the approach has left of it; empty if it is not, or nothing is known."""
+    setup, fit = run.setup, run.identification.protocols.get("slip_corrected")
+    if fit is None or setup.speed_um_s is None or setup.touch_uN is None or setup.touched_s is None:
+        return ""
+    model = fit.model()
+    used_um = slip_used_up_um(model, speed_um_s=setup.speed_um_s, touch_uN=setup.touch_uN, touched_s=setup.touched_s)
+    if used_um <= _USED_UP * model.slip_um:
+        return ""
+    how_much = f"{used_um:.2g} µm" if math.isfinite(used_um) else "any part"
+    return (
+        f"the approach at {setup.speed_um_s:g} µm/s may have used up {how_much} of it, and this is what was left: "
+        "press a fresh specimen several times as fast"
     )
 
 
@@ -258,6 +282,12 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
     if beyond:
         notes.append(
             f"The model does not explain the record as fitted by {', '.join(beyond)}: do not quote its numbers."
+        )
+    ahead_um = surface_ahead_um(run.first.deformations) if run.setup.touch_uN is not None else None
+    if ahead_um is not None and abs(ahead_um) > _SURFACE_UM:
+        notes.append(
+            f"The camera shows the surface {abs(ahead_um):.3g} µm {'beyond' if ahead_um > 0.0 else 'before'} where the "
+            "approach felt a contact: the specimen was pressed less or more deeply than asked for by as much."
         )
     if not run.setup.guarded:
         notes.append("No force guard watched over the indentation: the rig file's safety section states none.")

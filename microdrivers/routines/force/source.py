@@ -63,6 +63,7 @@ class IndentationSetup(NamedTuple):
         speed_um_s: of the tool while loading.
         tare_uN: the sensor's zero that was in use.
         guarded: whether a force guard of the rig watched.
+        touch_uN: the rise of the force by which the approach found the specimen. touched_s: how long it felt it.
     """
 
     sensor: str
@@ -75,6 +76,8 @@ class IndentationSetup(NamedTuple):
     speed_um_s: float | None
     tare_uN: float | None
     guarded: bool = True
+    touch_uN: float | None = None
+    touched_s: float | None = None
 
 
 class IndentationSource(Protocol):

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Sequence
 
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.errors import DataError, SaturatedData, TargetLost
 from microdrivers.core.samples import ForceSample
-from microdrivers.devices.force_sensor import SATURATED
+from microdrivers.core.units import NS_PER_S
+from microdrivers.devices.force_sensor import SATURATED, ForceSensor
+from microdrivers.routines.force.frames import TOUCHES_UN
 from microdrivers.routines.force.press_settings import DEPTHS_UM
 
 LOST_FRAMES = 15
 """In a row: half a second at 30 Hz, in which a probe goes on by 2.5 µm at the paper's speed."""
+
+_TOUCH_SIGMAS, _TOUCH_READINGS = 8.0, 3
+"""It is a touch if so many readings in a row exceed so many standard deviations of the tare, and TOUCHES_UN."""
+
+_BLOCK_S, _BEFORE, _BETWEEN = 0.05, 10, 5
+"""A rise is that of a block's mean over the mean of so many blocks, with so many between."""
 
 
 class Felt:
@@ -77,6 +87,74 @@ class Felt:
             "or allow more force: --max-force-uN, and the guard's limit in the rig file's safety section",
             moved="yes",
         )
+
+
+class Touch(Felt):
+    """Whether a tool has met something: the force exceeds a threshold, or has risen against what it was shortly before.
+
+    Means rise clearly above the noise long before single readings do. A drift, too, leads to either in the end; what
+    goes away with the tool (`is_over`, when it has gone back) is no drift.
+
+    Args:
+        sensor: tared.
+
+    Attributes:
+        touch_uN: the threshold by which it was felt, or would be.
+    """
+
+    def __init__(self, sensor: ForceSensor) -> None:
+        sigma_uN = sensor.tared.sigma_uN if sensor.tared is not None else 0.0
+        self.touch_uN = max(TOUCHES_UN, _TOUCH_SIGMAS * sigma_uN)
+        super().__init__(self.touch_uN, _TOUCH_READINGS)
+        self._size = max(1, round(_BLOCK_S * sensor.stream_rate_hz))
+        # Noise within the bandwidth is the same in neighbouring readings: they count as fewer.
+        independent = max(1.0, self._size * min(1.0, 2.0 * sensor.bandwidth_hz / sensor.stream_rate_hz))
+        mean_uN = _TOUCH_SIGMAS * sigma_uN * math.sqrt((1.0 + 1.0 / _BEFORE) / independent)
+        self._rise_uN = max(TOUCHES_UN, mean_uN)
+        self._block: list[ForceSample] = []
+        self._means_uN: deque[float] = deque(maxlen=_BEFORE + _BETWEEN + 1)
+        self._from_uN = 0.0
+        self._since_ns = self._until_ns = 0
+        self._risen = False
+
+    @property
+    def enough(self) -> bool:
+        """It has."""
+        return self._risen or super().enough
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the force has gone back by more than half of the touch since."""
+        left_uN = self._means_uN[-1] if self._means_uN else 0.0
+        return abs(self.force_uN - left_uN) > 0.5 * self.touch_uN
+
+    @property
+    def pressed_s(self) -> float:
+        """How long it was felt at most."""
+        return (self._until_ns - self._since_ns) / NS_PER_S + _BLOCK_S
+
+    def take(self, sample: ForceSample) -> None:
+        """Take a reading."""
+        if not self.enough and self._beyond == 0:
+            self._since_ns = sample.t_ns
+        super().take(sample)
+        if math.isfinite(sample.force_uN):
+            self._block.append(sample)
+            if len(self._block) == self._size:
+                self._take_mean(self._block)
+                self._block = []
+
+    def _take_mean(self, block: Sequence[ForceSample]) -> None:
+        mean_uN = sum(sample.force_uN for sample in block) / len(block)
+        self._means_uN.append(mean_uN)
+        if not self.enough and len(self._means_uN) == self._means_uN.maxlen:
+            before_uN = sum(list(self._means_uN)[:_BEFORE]) / _BEFORE
+            if mean_uN - before_uN > self._rise_uN:
+                self._risen, self.force_uN, self._from_uN = True, mean_uN, before_uN
+                self.touch_uN, self._since_ns = self._rise_uN, block[0].t_ns
+        if self.enough and abs(mean_uN - self._from_uN) > self.touch_uN:
+            self._until_ns = block[-1].t_ns
+        self._until_ns = max(self._until_ns, self._since_ns)
 
 
 class Lost:

@@ -38,8 +38,8 @@ class OpticsRun(NamedTuple):
         arrivals: bus-wide order numbers in the order in which the estimator saw the samples.
         recorded: those samples, if asked for.
         past_run: what a recording tells of its run.
-        last_zoom: the newest reading, which no frame need have been used with; of a run that ended as planned, with
-            the last frame that was taken. None without any.
+        last_zoom: the newest reading, which no frame need have been used with; of a run that ended as planned, and
+            whose recording does not lack the last frames, with the last frame that was taken. None without any.
     """
 
     complete: bool
@@ -120,7 +120,7 @@ def calibrate_optics(
     with noted_ending(bus, source.clock, DONE, finish=finish) as ending:
         source.run(begin, progress or SilentProgress())
     ended_by = ending.ended_by
-    if ended_by:
+    if ended_by or source.past_run.lost_last:
         newest_zoom = zoom.latest
     return OpticsRun(
         complete=not ended_by,
@@ -150,7 +150,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         unmatched_frames=run.unmatched_frames,
     )
     final, parameters = choice.estimate, choice.parameters
-    outdated = choice.frames_since_change > 0
+    outdated = choice.frames_since_change > 0 or _changed_unseen(run)
     p = final.projection
     pitch_um = run.optics.pixel_pitch_um
     scales = _trace([e.scale_px_per_um for e in run.estimates])
@@ -241,14 +241,14 @@ def _traces(estimates: Sequence[OpticsEstimate], scales: Trace) -> Traces:
 
 def _notes(run: OpticsRun, choice: Choice) -> list[str]:
     notes = []
-    since, seen = choice.frames_since_change, run.estimates[-1].zoom
+    since = choice.frames_since_change
     if since:
         notes.append(
             f"The run ended {_frames(since)} after the zoom began to change, too few for the new zoom "
             f"({choice.why_not_newer}): this is the calibration at zoom {choice.estimate.zoom:.4g}, and the zoom "
-            f"now reads {seen:.4g}."
+            f"now reads {run.estimates[-1].zoom:.4g}."
         )
-    elif run.last_zoom is not None and abs(run.last_zoom - seen) > run.settings.zoom_still * abs(seen):
+    elif _changed_unseen(run):
         lost = " Texture, unlike a square, is not found again once the zoom has changed." if run.lost_frames else ""
         notes.append(
             f"The zoom changed to {run.last_zoom:.4g}, where no frame could be used: this is the calibration at zoom "
@@ -258,7 +258,7 @@ def _notes(run: OpticsRun, choice: Choice) -> list[str]:
         notes.append("The run was interrupted; the result holds what had been measured until then.")
     elif run.past_run.ended_by:
         notes.append(
-            f"The recorded run ended early: {run.past_run.ended_by}. "
+            f"The recorded run is not whole: {run.past_run.ended_by}. "
             "The result holds what had been measured until then."
         )
     notes += run.past_run.notes()
@@ -269,6 +269,12 @@ def _notes(run: OpticsRun, choice: Choice) -> list[str]:
     if run.optics.pixel_pitch_um is None:
         notes.append("The pixel pitch is not known, so no magnification is given; the scale is complete without it.")
     return notes
+
+
+def _changed_unseen(run: OpticsRun) -> bool:
+    """Whether the zoom has left that of the last frame that could be used."""
+    seen = run.estimates[-1].zoom
+    return run.last_zoom is not None and abs(run.last_zoom - seen) > run.settings.zoom_still * abs(seen)
 
 
 def _frames(number: int) -> str:

@@ -49,7 +49,7 @@ class OpticsReplay:
         self._frames: list[Frame] = []
         self._replay = Replay(recording, self.bus, admit=self._admit)
         self._before: _Before | None = None
-        self._frames_told = self._lost_frames = 0
+        self._frames_told = self._lost_frames = self._lost_last = 0
 
     def run(self, begin: Callable[[PointTracker], None], progress: Progress) -> None:
         """Publish the whole recording."""
@@ -72,6 +72,8 @@ class OpticsReplay:
         self._before = _Before(seq=camera.history[-1].seq, missing=0)
         begin(tracker)
         replay.as_arrived(HOST, (self.names.stage, self.names.zoom, self.names.camera), None)
+        if self._frames_expected is not None and self._done and not self._done[-1].content["ended_by"]:
+            self._lost_last = min(self._frames_expected - self._frames_told, replay.missing - self._before.missing)
         if replay.missing:
             progress.step(f"missing in the recording, of the samples that the estimator had: {replay.missing}")
         replay.require(self.bus.topic(self.names.stage, XYThetaSample), self.bus.topic(self.names.zoom, ZoomSample))
@@ -79,9 +81,9 @@ class OpticsReplay:
     @property
     def past_run(self) -> PastRun:
         """What the recording says of it."""
-        cut = "" if self._recording.complete else "the recording was cut off, and does not tell the run's end"
+        lost = self._lost_frames + self._lost_last
         return past_run(
-            self._recording, self._done, missing=self._replay.missing, broken_off=cut, lost_frames=self._lost_frames
+            self._recording, self._done, missing=self._replay.missing, lost_frames=lost, lost_last=self._lost_last
         )
 
     @property

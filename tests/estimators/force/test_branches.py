@@ -98,6 +98,21 @@ def test_a_drifting_baseline_is_no_contact():
     assert found.lost == still.lost
 
 
+@pytest.mark.parametrize("drift_uN_per_s", [-1.0, 1.0])
+@pytest.mark.parametrize("preset", ["single", "unloading_springs"])
+def test_a_drift_is_no_contact_at_either_end_however_slowly_it_is_pressed(preset, drift_uN_per_s):
+    """At 2 µm/s it is an eighth of what the force grows by."""
+    push = Push(start_um=-4.0, depth_um=60.0, speed_um_s=2.0, rest_s=2.0)
+    truth = indented(PRESETS[preset], push)
+    for seed in range(3):
+        record = recorded(preset, push, Noise(0.03, 1.5, drift_uN_per_s=drift_uN_per_s), seed=seed)
+        found = find_branches(
+            record.time_s, record.deformation_um, record.force_uN, deformation_sigma_um=0.03, force_sigma_uN=1.5
+        )
+        assert found.onset_s[0] - 0.01 <= truth.contact_s <= found.onset_s[1] + 0.5
+        assert found.release_s[0] - 0.1 <= truth.time_s[truth.in_contact][-1] <= found.release_s[1] + 0.1
+
+
 def test_a_force_that_falls_while_pressed_is_refused():
     record = recorded("single")
     with pytest.raises(NoContact, match="does not rise"):

@@ -50,3 +50,13 @@ def test_a_slow_drift_of_a_quiet_sensor_leaves_no_baseline():
 @pytest.mark.parametrize("length", range(9, 20))
 def test_a_slow_rise_in_a_few_samples_is_no_error(length):
     assert find_departure(force(0.0, 4.8, 0.0, at=0, length=length), 3.0) is None
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_slow_rise_is_not_passed_over_for_the_step_at_the_reversal(seed):
+    """A rise of a tenth of the noise a sample drags a short baseline along until it turns."""
+    rise = force(5.0, 0.1, 1.0, at=60, length=1600, seed=seed)
+    rise[1200:] -= 20.0
+    early, late = find_departure(rise, 1.0)
+    assert early <= 60 + 2
+    assert 60 - 2 <= late < 80

@@ -74,6 +74,101 @@ def test_a_noisy_or_drifting_sensor_widens_intervals_and_moves_nothing(preset, n
     assert not any("adhesion" in note or "contact was lost" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("drift_uN_per_s", [-1.0, 1.0])
+@pytest.mark.parametrize("preset", ["single", "unloading_springs"])
+def test_a_drift_is_neither_a_slip_nor_an_adhesion_however_slowly_it_is_pressed(preset, drift_uN_per_s):
+    push = Push(start_um=-4.0, depth_um=100.0, speed_um_s=2.0, rest_s=2.0)
+    found = identify(recorded(preset, push, Noise(0.03, 1.5, drift_uN_per_s=drift_uN_per_s)))
+    fit, specimen = found.protocols[found.best], PRESETS[preset]
+    assert found.best == preset
+    assert not found.slip.identifiable
+    assert abs(fit.k1_uN_per_um - specimen.k1) < 4.0 * fit.sigma_k1_uN_per_um < 0.02
+    assert abs(fit.b_loading_uN_s_per_um - specimen.b_loading) < 4.0 * fit.sigma_b_uN_s_per_um < 0.5
+    (note,) = found.notes
+    assert note.startswith("the force out of contact drifts by ")
+    assert float(note.split()[7]) == pytest.approx(drift_uN_per_s, abs=0.02)
+    assert "taken off everywhere" in note
+
+
+def test_intervals_hold_what_the_line_of_a_drift_is_uncertain_by():
+    """It tilts the force of the loading against that of the unloading, which is what b is read from."""
+    push, noise = Push(start_um=-10.0, depth_um=110.0), Noise(0.03, 1.5)
+    z = []
+    for seed in range(8):
+        still, drifting = (
+            identify(recorded("unloading_springs", push, one, seed=seed)).protocols["unloading_springs"]
+            for one in (noise, dataclasses.replace(noise, drift_uN_per_s=-1.0))
+        )
+        assert drifting.sigma_b_uN_s_per_um > 1.4 * still.sigma_b_uN_s_per_um
+        z.append((drifting.b_loading_uN_s_per_um - 51.3317) / drifting.sigma_b_uN_s_per_um)
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_a_damper_that_hardly_shows_is_found_in_the_noise():
+    """Neither the contact nor its loss are steps there, only the reversal is."""
+    specimen, push = Specimen(5.98, 2e-4, 10.0, 10.0), Push(start_um=-2.0, depth_um=26.0, speed_um_s=0.5, rest_s=0.5)
+    found = identify(recorded(specimen, push, Noise(0.1, 1.0), of="tip"))
+    assert found.best == "single"
+    assert found.contact.seen == "tip"
+    assert not found.slip.identifiable
+    assert found.notes == ()
+    fit = found.protocols["single"]
+    assert abs(fit.b_loading_uN_s_per_um - 10.0) < 4.0 * fit.sigma_b_uN_s_per_um
+
+
+@pytest.mark.parametrize(("b_unloading", "best", "wrong"), [(1.0, "single", "unloading_springs"),
+                                                            (0.0, "unloading_springs", "single")])  # fmt: skip
+def test_what_the_best_protocol_contradicts_is_not_determined(b_unloading, best, wrong):
+    """Both explain the record within noise, one of them far better."""
+    specimen = Specimen(2.7, 1e-4, 1.0, b_unloading)
+    found = identify(recorded(specimen, Push(depth_um=60.0, rest_s=1.0), Noise(0.1, 3.0)))
+    assert found.best == best
+    assert found.protocols[wrong].within_noise
+    assert all(found.protocols[best].identifiable[name] for name in ("k1", "k2", "b"))
+    assert not any(found.protocols[wrong].identifiable[name] for name in ("k1", "k2", "b"))
+    assert f"{best} explains the record better with" in found.protocols[wrong].weak["b"]
+
+
+def test_a_loading_that_the_best_protocol_contradicts_is_not_determined():
+    found = identify(recorded(Specimen(5.0, 1e-4, 28.0, 0.0, slip_um=6.0), Push(depth_um=40.0), Noise(0.06, 2.0)))
+    loading = found.protocols["loading"]
+    assert found.best == "slip_corrected"
+    assert loading.within_noise
+    assert not loading.identifiable["b"]
+    assert "slip_corrected explains both branches with" in loading.weak["b"]
+
+
+def test_the_best_has_brackets_where_a_slip_that_is_not_determined_is_far_likelier():
+    specimen = Specimen(4.05, 1e-4, 50.0, 0.0, slip_um=21.6, slip_rate=0.03)
+    push = Push(depth_um=31.0, back_um_s=10.0)
+    record = part(recorded(specimen, push, Noise(0.01, 4.0), of="tip"), 0.0, 12.2)
+    found = identify(record)
+    assert found.best == "unloading_springs"
+    assert not found.protocols["unloading_springs"].identifiable["b"]
+    assert "slip_corrected explains the record better" in found.protocols["unloading_springs"].weak["b"]
+    assert "95 % interval" in found.slip.reason
+    assert "as well or better" not in found.slip.reason
+
+
+def test_a_slip_that_outruns_the_tool_is_not_all_in_the_record():
+    """Until it has slowed down to the tool's speed there is no force."""
+    found = identify(recorded("slip_corrected", Push(start_um=-4.0, speed_um_s=2.0, depth_um=80.0)))
+    assert found.best == "slip_corrected"
+    assert found.slip.offset_um < 22.0
+    assert not found.slip.identifiable
+    assert "hardly slower than the tool (2 µm/s)" in found.slip.reason
+
+
+def test_branches_that_are_too_short_are_named_with_a_misfit():
+    specimen, push = Specimen(4.5161, 1e-4, 5.0, 5.0), Push(speed_um_s=100.0, acceleration_um_s2=2000.0)
+    found = identify(recorded(specimen, push, Noise(0.03, 1.5)))
+    assert found.misfit.found
+    (note,) = (note for note in found.notes if note.startswith("too short"))
+    assert "the loading " in note
+    assert "the unloading " in note
+    assert not any(note.startswith("too short") for note in identified("viscoelastic").notes)
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_what_two_protocols_explain_alike_is_not_determined(seed):
     """Where the contact is not seen, half the damper both ways explains what the whole one does on the way in alone."""
@@ -300,7 +395,7 @@ def test_loading_alone_does_what_it_can():
     assert found.best == "loading"
     assert found.slip is None
     assert is_near(found.protocols["loading"], PRESETS["single"])
-    assert any("no unloading" in note for note in found.notes)
+    assert any("no unloading" in note and "whether the specimen slips" in note for note in found.notes)
 
 
 def test_a_record_that_begins_in_contact_says_how_weak_its_damper_is():

@@ -163,6 +163,26 @@ def test_settings_that_cannot_work_are_refused(lag: int, window: int) -> None:
         LocalMotion(MotionSettings(lag=lag, window=window))
 
 
+@pytest.mark.parametrize(("at", "known"), [(60.0, False), (60.05, False), (60.5, True)])
+def test_a_position_at_a_corner_may_be_of_either_speed(at: float, known: bool) -> None:
+    t, x, _ = legs((at / RATE_HZ,), (5.0, -5.0), 4.0)
+    found = told(LocalMotion(SHORT), t, x + 0.02 * np.random.default_rng(3).standard_normal(len(t)), sigma_um=0.02)
+    near = [k for k, motion in enumerate(found) if motion.corner_um_s > 0.0]
+    assert near == ([] if known else [60])
+    assert all(found[k].corner_um_s == pytest.approx(10.0, abs=2.0) for k in near)
+
+
+def test_what_changes_within_the_window_shows_beyond_noise_alone() -> None:
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
+    noise = 0.02 * rng.standard_normal(len(t))
+    steady = told(LocalMotion(SHORT), t, 5.0 * t + noise, sigma_um=0.02)
+    assert np.mean([m.late_um_s > 0.0 for m in steady]) < 0.02
+    quickens = told(LocalMotion(SHORT), t, 5.0 * t + 1.5 * t * t + noise, sigma_um=0.02)
+    late = np.array([m.late_um_s for m in quickens[30:]])
+    assert np.median(late) == pytest.approx(3.0 * 5.0 / RATE_HZ, rel=0.2)
+
+
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(5, 25), st.booleans())
 def test_fit_and_gains_equal_least_squares(seed: int, count: int, parabola: bool) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from microdrivers import __version__
 from microdrivers.core.errors import ConfigError, UnsupportedError
 from microdrivers.recording.reader import Recording
 from microdrivers.routines.analysis import (
@@ -61,7 +62,10 @@ def test_an_optical_calibration_and_a_force_characterisation(optics_recording, f
     row = analyse_recording(str(force_recording))
     assert (row["error"], row["kind"]) == (None, "force-characterisation")
     with Recording(force_recording) as recording:
-        assert row["k1_uN_per_um"] == analyse_force(recording).protocols[row["protocol"]].k1_uN_per_um
+        result, _ = analyse_force(recording)
+    assert row["k1_uN_per_um"] == result.protocols[row["protocol"]].k1_uN_per_um
+    assert row["notes"] == " ".join(result.notes)
+    assert (row["complete"], row["doubtful"]) == (True, False)
 
 
 def test_this_process_and_two_others_give_the_same_bytes_and_bad_files_have_rows(
@@ -84,6 +88,7 @@ def test_this_process_and_two_others_give_the_same_bytes_and_bad_files_have_rows
     assert rows["empty.mcap"]["error"].startswith("EmptyRecording")
     assert rows["foreign.mcap"]["error"].startswith("ForeignRecording")
     assert int(rows["torn.mcap"]["losses"]) > 0
+    assert {name: row["doubtful"] for name, row in rows.items() if row["doubtful"] != "1"} == {"a.mcap": "0"}
     assert float(rows["a.mcap"]["scale_px_per_um"]) == one.rows[0]["scale_px_per_um"]
     assert not (tmp_path / "one.csv.journal").exists()
 
@@ -134,7 +139,8 @@ def test_a_file_that_kills_its_process_has_a_row(files, tmp_path):
     deadly.write_bytes(b"x")
     report = analyse_recordings([files[0], str(deadly)], tmp_path / "t.csv", jobs=1, analyse=fake_row)
     assert report.failed == 1
-    assert next(row for row in report.rows if row["error"])["file"] == str(deadly)
+    failed = next(row for row in report.rows if row["error"])
+    assert (failed["file"], failed["doubtful"], report.doubtful) == (str(deadly), True, [])
     assert [row["error"] is None for row in report.rows] == [True, False]
 
 
@@ -151,7 +157,11 @@ def test_tables_are_refused(in_process, files, tmp_path):
         with pytest.raises(ConfigError, match=told):
             analyse_recordings(files, tmp_path / name, analyse=fake_row)
     (tmp_path / "b.csv.journal").write_text("something else\n")
-    with pytest.raises(ConfigError, match="no journal"):
+    with pytest.raises(ConfigError, match="not a journal"):
+        analyse_recordings(files, tmp_path / "b.csv", analyse=fake_row)
+    older = {"journal": "microdrivers analyse", "microdrivers": __version__, "columns": [*COLUMNS][:-1]}
+    (tmp_path / "b.csv.journal").write_text(json.dumps(older) + "\n")
+    with pytest.raises(ConfigError, match="another version of microdrivers"):
         analyse_recordings(files, tmp_path / "b.csv", analyse=fake_row)
     with ResultsTable(tmp_path / "c.csv"), pytest.raises(ConfigError, match="another program"):
         ResultsTable(tmp_path / "c.csv")
