@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.record import CLEAR
 
 SHORTEST_BASELINE = 15
 """Samples out of contact at either end that a drift takes to be seen."""
@@ -80,16 +81,19 @@ def straight_drift(time_s: Array, force_uN: Array, sigma_uN: float) -> Baseline 
     """
     head = _straight(time_s, force_uN, sigma_uN)
     tail = _straight(-time_s[::-1], force_uN[::-1], sigma_uN)
-    if min(head.sure, tail.sure) < SHORTEST_BASELINE or head.sure + tail.sure > len(time_s):
+    n = len(time_s)
+    if min(head.likely, tail.likely) < SHORTEST_BASELINE or min(head.sure, tail.sure) < _FEWEST or head.sure == n:
         return None
-    ends = (slice(head.sure), slice(len(time_s) - tail.sure, None))
+    ends = (slice(head.sure), slice(n - tail.sure, n))
     t, force = (np.concatenate([values[end] for end in ends]) for values in (time_s, force_uN))
     line = line_through(t, force, sigma_uN)
     apart = sum(float(_misfits(time_s[end], force_uN[end])[-1]) for end in ends)
     on_one_line = _misfits(t, force)[-1] - apart < _ONE_LINE * sigma_uN**2
-    likely = (slice(head.likely), slice(-tail.likely, None))
+    likely = (slice(head.likely), slice(n - tail.likely, n))
     own = [line_through(time_s[end], force_uN[end], sigma_uN) for end in likely]
-    return line if on_one_line and line.is_clear and _slope_alike(own, line) else None
+    pressed_uN = np.max((force_uN - line.at(time_s))[head.likely : n - tail.likely], initial=0.0)
+    known = on_one_line and line.is_clear and _slope_alike(own, line) and pressed_uN > CLEAR * sigma_uN
+    return line if known else None
 
 
 def _slope_alike(ends: Sequence[Baseline], line: Baseline) -> bool:

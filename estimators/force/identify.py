@@ -34,7 +34,7 @@ _SIMPLER = 1.1
 """Of the smallest error: what a protocol with fewer parameters may have and still be preferred."""
 
 _NEARLY = 0.75
-"""Of the tool's speed: what a slip that was faster is estimated at, for it has slowed down until a force is noticed."""
+"""Of the tool's speed: what a slip that was faster has slowed down to at most until a force is noticed."""
 
 _CLEARLY = 0.5
 """Of the smallest error without a slip: what one leaves that is not well determined and is preferred all the same."""
@@ -90,7 +90,8 @@ class Identification:
     """What one indentation says about a specimen.
 
     Attributes:
-        protocols: by name; those that the record allows: without an unloading only `loading`.
+        protocols: by name; those that the record allows: without an unloading only `loading`. A number is not
+            `identifiable` either where one of the likeliest protocols, or the best, says otherwise.
         best: name of the one that explains both branches best: within noise and by likelihood, or else by the error,
             the simpler one where that makes no difference. `slip_corrected` never is where its slip cannot be one
             (`Slip.reason`); where that is only imprecise, if no other explains the record nearly as well.
@@ -195,20 +196,19 @@ def _with_weak(fit: ProtocolFit, more: Mapping[str, str]) -> ProtocolFit:
 
 
 def _hidden_by_slip(prepared: Prepared, fit: Fit, slipped: ProtocolFit) -> dict[str, str]:
-    """What a slip may pass for, where it is preferred."""
-    names = ["slip", "slip_rate", *slipped.springs_and_damper]
+    """Why none of its parameters is determined where a slip is preferred, but may hide something else; empty if not."""
     b_unloading = damping_on_the_way_back(prepared, fit, far_likelier=_AS_LIKELY)
+    at_first_um_s = slipped.slip_um * slipped.slip_rate_per_s
     if b_unloading:
         why = f"a damper of {b_unloading:.2g} µN·s/µm on the way back, too, explains the record better"
-        return dict.fromkeys(names, why)
-    at_first_um_s = slipped.slip_um * slipped.slip_rate_per_s
-    if at_first_um_s <= _NEARLY * slipped.fastest_um_s:
+    elif at_first_um_s > _NEARLY * slipped.fastest_um_s:
+        why = (
+            f"at first it slips by {at_first_um_s:.2g} µm/s, hardly slower than the tool ({slipped.fastest_um_s:.2g} "
+            "µm/s), and before it may have outrun the tool, without a force: press faster"
+        )
+    else:
         return {}
-    why = (
-        f"at first it slips by {at_first_um_s:.2g} µm/s, hardly slower than the tool ({slipped.fastest_um_s:.2g} "
-        "µm/s): a slip that outruns the tool leaves no force, and that part is not in the record"
-    )
-    return {"slip": why, "b": why}
+    return dict.fromkeys(("slip", "slip_rate", *slipped.springs_and_damper), why)
 
 
 def _is_ruled_out(one: ProtocolFit, other: ProtocolFit) -> bool:

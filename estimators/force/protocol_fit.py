@@ -62,7 +62,8 @@ class ProtocolFit:
         noise_residual_ratio: RMS(F − F̂) relative to what noise of force and deformation alone leaves.
         condition_number: of the scaled regressor of eq. (22) on the protocol's samples.
         identifiable: for k1, k2, b, m (and slip, slip_rate): the record determines it, and the model explains the
-            samples that it is estimated from within their noise; otherwise the number is no property of the specimen.
+            samples that it is estimated from within their noise, and no other that explains both branches contradicts
+            it (see `Identification`); otherwise the number is no property of the specimen.
         weak: reasons, for those that it does not determine. imprecise: of these, the ones of which no more is amiss
             than that their intervals are wide.
         force_uN: F̂ at every sample of the record, baseline included; without contact the baseline.

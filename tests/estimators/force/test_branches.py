@@ -102,7 +102,7 @@ def test_a_drifting_baseline_is_no_contact():
 @pytest.mark.parametrize("preset", ["single", "unloading_springs"])
 def test_a_drift_is_no_contact_at_either_end_however_slowly_it_is_pressed(preset, drift_uN_per_s):
     """At 2 µm/s it is an eighth of what the force grows by."""
-    push = Push(start_um=-4.0, depth_um=60.0, speed_um_s=2.0, rest_s=2.0)
+    push = Push(start_um=-4.0, depth_um=80.0, speed_um_s=2.0, rest_s=2.0)
     truth = indented(PRESETS[preset], push)
     for seed in range(3):
         record = recorded(preset, push, Noise(0.03, 1.5, drift_uN_per_s=drift_uN_per_s), seed=seed)

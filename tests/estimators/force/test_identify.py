@@ -77,12 +77,12 @@ def test_a_noisy_or_drifting_sensor_widens_intervals_and_moves_nothing(preset, n
 @pytest.mark.parametrize("drift_uN_per_s", [-1.0, 1.0])
 @pytest.mark.parametrize("preset", ["single", "unloading_springs"])
 def test_a_drift_is_neither_a_slip_nor_an_adhesion_however_slowly_it_is_pressed(preset, drift_uN_per_s):
-    push = Push(start_um=-4.0, depth_um=100.0, speed_um_s=2.0, rest_s=2.0)
+    push = Push(start_um=-4.0, depth_um=80.0, speed_um_s=2.0, rest_s=2.0)
     found = identify(recorded(preset, push, Noise(0.03, 1.5, drift_uN_per_s=drift_uN_per_s)))
     fit, specimen = found.protocols[found.best], PRESETS[preset]
     assert found.best == preset
     assert not found.slip.identifiable
-    assert abs(fit.k1_uN_per_um - specimen.k1) < 4.0 * fit.sigma_k1_uN_per_um < 0.02
+    assert abs(fit.k1_uN_per_um - specimen.k1) < 4.0 * fit.sigma_k1_uN_per_um < 0.03
     assert abs(fit.b_loading_uN_s_per_um - specimen.b_loading) < 4.0 * fit.sigma_b_uN_s_per_um < 0.5
     (note,) = found.notes
     assert note.startswith("the force out of contact drifts by ")
@@ -92,16 +92,14 @@ def test_a_drift_is_neither_a_slip_nor_an_adhesion_however_slowly_it_is_pressed(
 
 def test_intervals_hold_what_the_line_of_a_drift_is_uncertain_by():
     """It tilts the force of the loading against that of the unloading, which is what b is read from."""
-    push, noise = Push(start_um=-10.0, depth_um=110.0), Noise(0.03, 1.5)
+    push, noise = Push(start_um=-10.0, depth_um=90.0), Noise(0.03, 1.5, drift_uN_per_s=-1.0)
+    still = identify(recorded("unloading_springs", push, Noise(0.03, 1.5))).protocols["unloading_springs"]
     z = []
-    for seed in range(8):
-        still, drifting = (
-            identify(recorded("unloading_springs", push, one, seed=seed)).protocols["unloading_springs"]
-            for one in (noise, dataclasses.replace(noise, drift_uN_per_s=-1.0))
-        )
-        assert drifting.sigma_b_uN_s_per_um > 1.4 * still.sigma_b_uN_s_per_um
-        z.append((drifting.b_loading_uN_s_per_um - 51.3317) / drifting.sigma_b_uN_s_per_um)
-    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.6
+    for seed in range(6):
+        fit = identify(recorded("unloading_springs", push, noise, seed=seed)).protocols["unloading_springs"]
+        assert fit.sigma_b_uN_s_per_um > 1.4 * still.sigma_b_uN_s_per_um
+        z.append((fit.b_loading_uN_s_per_um - 51.3317) / fit.sigma_b_uN_s_per_um)
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_a_damper_that_hardly_shows_is_found_in_the_noise():
@@ -151,12 +149,24 @@ def test_the_best_has_brackets_where_a_slip_that_is_not_determined_is_far_likeli
 
 
 def test_a_slip_that_outruns_the_tool_is_not_all_in_the_record():
-    """Until it has slowed down to the tool's speed there is no force."""
+    """Until it has slowed down to the tool's speed there is no force; what else there is hides behind it."""
     found = identify(recorded("slip_corrected", Push(start_um=-4.0, speed_um_s=2.0, depth_um=80.0)))
     assert found.best == "slip_corrected"
     assert found.slip.offset_um < 22.0
     assert not found.slip.identifiable
     assert "hardly slower than the tool (2 µm/s)" in found.slip.reason
+    assert not any(found.protocols["slip_corrected"].identifiable[name] for name in ("k1", "k2", "b"))
+    assert identified("slip_corrected").protocols["slip_corrected"].identifiable["k1"]
+
+
+def test_a_damper_on_the_way_back_does_not_pass_for_a_slip():
+    specimen = Specimen(2.5, 1e-4, 5.0, 5.0, slip_um=15.0, slip_rate=0.2)
+    found = identify(recorded(specimen, Push(depth_um=72.0), Noise(0.1, 1.0), of="tip"))
+    fit = found.protocols["slip_corrected"]
+    assert found.best == "slip_corrected"
+    assert abs(fit.b_loading_uN_s_per_um - 5.0) > 10.0 * fit.sigma_b_uN_s_per_um
+    assert not any(fit.identifiable[name] for name in ("k1", "k2", "b"))
+    assert "a damper of 5" in found.slip.reason
 
 
 def test_branches_that_are_too_short_are_named_with_a_misfit():
