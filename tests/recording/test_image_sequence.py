@@ -63,21 +63,20 @@ def test_real_micrographs_calibrate_to_their_stated_projection(tmp_path):
 
 def test_a_zoom_at_which_nothing_was_found_is_told(tmp_path):
     folder = shutil.copytree(MICROGRAPHS, tmp_path / "sequence")
-    result = calibrate(folder, tmp_path / "one")
-    assert "The zoom changed" not in result.stdout
     rows = ImageSequence(folder).rows
     blank = np.zeros_like(ImageSequence(folder).load(rows[0]))
     for row in rows[20:]:
         edit_cell(folder, row.line, "zoom", "1.5")
         cv2.imwrite(str(row.file), blank)
-    result = calibrate(folder, tmp_path / "two")
+    result = calibrate(folder, tmp_path / "one")
     assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (1, True), result.output
-    found = json.loads((tmp_path / "two" / "result.json").read_text())
+    found = json.loads((tmp_path / "one" / "result.json").read_text())
     assert not found["complete"]
     [told] = [note for note in found["notes"] if "The zoom changed" in note]
     assert "The zoom changed to 1.5, where no frame could be used: this is the calibration at zoom 1." in told
-    result = calibrate(folder, tmp_path / "three", "--frames", "20")
-    assert (result.exit_code, "NOT COMPLETE" in result.stdout) == (0, False), result.output
+    result = calibrate(folder, tmp_path / "two", "--frames", "20")
+    assert result.exit_code == 0, result.output
+    assert not any(told in result.stdout for told in ("NOT COMPLETE", "The zoom changed"))
 
 
 def test_comments_and_further_columns_are_allowed(sequence):

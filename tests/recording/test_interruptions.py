@@ -17,7 +17,7 @@ from microdrivers.recording.mcap_scan import NOT_ENDED
 from microdrivers.recording.reader import Recording
 
 WRITING = {module.__file__ for module in (mcap_records, mcap_writer, recorder, sample_file)}
-STRIDE = 7
+STRIDE = 29
 """Of all moments, so many are looked at for one."""
 
 

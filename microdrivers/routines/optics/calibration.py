@@ -249,7 +249,7 @@ def _notes(run: OpticsRun, choice: Choice) -> list[str]:
             f"now reads {run.estimates[-1].zoom:.4g}."
         )
     elif _changed_unseen(run):
-        lost = " Texture, unlike a square, is not found again once the zoom has changed." if run.lost_frames else ""
+        lost = " A target of texture is not found again once the zoom has changed." if run.lost_frames else ""
         notes.append(
             f"The zoom changed to {run.last_zoom:.4g}, where no frame could be used: this is the calibration at zoom "
             f"{choice.estimate.zoom:.4g}.{lost}"
