@@ -83,6 +83,11 @@ class OpticsCalibrator:
         """Frames that had no pose or no zoom sample close enough on both sides."""
         return self._synchroniser.unmatched + self.skipped_frames
 
+    @property
+    def waiting_frames(self) -> int:
+        """Frames that wait for a pose and a zoom sample after them; none does if these go on after the last frame."""
+        return self._synchroniser.waiting
+
     def update(self, sample: Sample) -> list[Sample]:
         """Take one sample of any of the three streams.
 

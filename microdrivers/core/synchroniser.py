@@ -92,6 +92,11 @@ class Synchroniser(Generic[SampleT]):
         self._max_waiting = max_waiting
         self.unmatched = 0
 
+    @property
+    def waiting(self) -> int:
+        """How many samples wait for a reference after them."""
+        return len(self._waiting)
+
     def add_reference(self, name: str, sample: Sample) -> None:
         """Take a sample of a reference stream."""
         self._streams[name].add(sample)

@@ -20,7 +20,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from microdrivers.recording.mcap_records import CHUNK, MAGIC, MESSAGE, RECORD, parsed, records_in
+from microdrivers.recording.mcap_records import CHUNK, MAGIC, MESSAGE, RECORD, parsed, records_in, written
 from microdrivers.recording.mcap_summary import Summary, find_end, read_footer, read_summary
 
 NOT_ENDED = "the recording was not ended"
@@ -38,6 +38,7 @@ _CHUNK_PATTERN = re.compile(rb"\x06(?=.{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}
 _LOOKAHEAD = CHUNK.size + 12
 _PAGE_BYTES = 4096
 """So much of a file an operating system reads or fails to read at once."""
+_BETWEEN_CHUNKS = frozenset({Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT})
 _OTHERS = frozenset({
     Opcode.HEADER, Opcode.FOOTER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END,
 })  # fmt: skip
@@ -203,9 +204,7 @@ class McapScan:
                 offset += length
                 continue
             head = window[begin : begin + _LOOKAHEAD]
-            length = self._plausible(head, offset)
-            if length is not None and not self._take_up(head, offset, length):
-                length = None
+            length = self._take_up(head, offset)
             if length is None:
                 following = self._next_chunk(offset + 1)
                 ends = following == self.size
@@ -220,18 +219,19 @@ class McapScan:
             else:
                 offset += length
 
-    def _take_up(self, head: bytes, offset: int, length: int) -> bool:
-        """Take up the record that begins with `head`; False if it is damaged, and perhaps its length too."""
-        opcode = head[0]
+    def _take_up(self, head: bytes, offset: int) -> int | None:
+        """Take up the record that begins with `head`; its whole length, None if that is not known."""
+        opcode, length = head[0], self._plausible(head, offset)
+        if opcode in _BETWEEN_CHUNKS and len(head) >= RECORD.size:
+            return self._other_record(opcode, offset, length)
+        if length is None:
+            return None
         if opcode == Opcode.CHUNK:
             self.chunks.append(ChunkPlace(offset, length, {}, compressed=head[CHUNK.size - 4] > 0))
-        elif opcode == Opcode.DATA_END:
-            end = find_end(self._read, offset + length, self.size)
-            self._end = end or self.size
-            return end is not None
-        elif not self._other_record(opcode, offset, length):
-            return self._plausible(self._read(offset + length, _LOOKAHEAD), offset + length) is not None
-        return True
+            return length
+        end = find_end(self._read, offset + length, self.size)
+        self._end = end or self.size
+        return None if end is None else length
 
     def _take_index(self, window: bytes, begin: int) -> int | None:
         """Take up the message index there, most of a file's records; its length, None if there is none."""
@@ -258,18 +258,27 @@ class McapScan:
                 agrees = agrees and (stored == size if not name_size else size < _LONGEST_CHUNK)
         return RECORD.size + length if agrees and offset + RECORD.size + length <= self.size else None
 
-    def _other_record(self, opcode: int, offset: int, length: int) -> bool:
-        """Take up what lies between chunks; False if it is damaged."""
-        body = self._read(offset, length)
+    def _other_record(self, opcode: int, offset: int, stated: int | None) -> int | None:
+        """Take up what lies between chunks; its length, which its content tells, too; None if it is not known."""
+        body = self._read(offset, max(stated or 0, _BLOCK_BYTES))
         record = parsed(opcode, body[RECORD.size :])
+        own = len(written(record)) if isinstance(record, Header | Metadata | Attachment) else 0
+        agree = own == stated
+        length = next((each for each in (own, stated) if each and (agree or self._goes_on(offset + each))), None)
         if isinstance(record, Header) and offset == len(MAGIC):
             self.profile = record.profile
-        elif isinstance(record, Metadata) or (isinstance(record, Attachment) and _has_its_crc(body)):
+        elif isinstance(record, Metadata) or (isinstance(record, Attachment) and _has_its_crc(body[:own])):
             self._records[offset] = record
-        else:
+        elif length is not None:
             self.losses.append(Loss(offset, length, f"a record of kind {opcode} is damaged"))
-            return False
-        return True
+            return length
+        if length is not None and length != stated:
+            self.losses.append(Loss(offset, 0, f"the length of a record of kind {opcode} is damaged, not its content"))
+        return length
+
+    def _goes_on(self, offset: int) -> bool:
+        """Whether the file ends there, or what may be a record begins."""
+        return offset == self.size or self._plausible(self._read(offset, _LOOKAHEAD), offset) is not None
 
     def _next_chunk(self, offset: int) -> int:
         """Where the next intact chunk begins; the file's size if there is none."""

@@ -84,7 +84,7 @@ def read_header(scan: McapScan) -> RecordingHeader:
     for data in records:
         number = data.get("schema_version", "")
         _check_version(file, int(number) if number.isdecimal() else 0, data.get("microdrivers", ""))
-    if scan.profile == PROFILE and _holds_samples(scan):
+    if scan.profile in (PROFILE, None) and _holds_samples(scan):
         scan.losses.append(Loss(0, 0, "the recording's header is damaged: who made it is not known"))
         return RecordingHeader(source="recorded")
     if not scan.chunks and (scan.profile == PROFILE or (scan.has_magic and scan.profile is None)):

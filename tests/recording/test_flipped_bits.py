@@ -10,7 +10,7 @@ from microdrivers.recording.reader import Recording
 
 HEAD = struct.Struct("<BQ")
 MAGIC_BYTES = 8
-MESSAGE_INDEX, DATA_END = 0x07, 0x0F
+BETWEEN_CHUNKS, MESSAGE_INDEX, DATA_END = (0x01, 0x09, 0x0C), 0x07, 0x0F
 
 
 @pytest.fixture
@@ -119,3 +119,21 @@ def test_chunks_that_the_summary_does_not_list_are_not_delivered(recorded, tmp_p
     with Recording(file) as recording:
         assert len(list(recording.samples())) < len(recorded.published)
         assert "1 chunks are of another recording" in [loss.what for loss in recording.losses]
+
+
+@pytest.mark.parametrize("cut_off", [False, True])
+def test_a_wrong_length_between_chunks_costs_nothing(small, tmp_path, cut_off):
+    data, file = small.read_bytes(), tmp_path / "flipped.mcap"
+    [end] = [begin for opcode, begin, _ in records(data) if opcode == DATA_END]
+    whole = data[:end] if cut_off else data
+    file.write_bytes(whole)
+    with Recording(file) as recording:
+        expected = content(recording)
+    for opcode, begin, _ in records(data[:end] + bytes(MAGIC_BYTES)):
+        for bit in range(64) if opcode in BETWEEN_CHUNKS else ():
+            flipped = bytearray(whole)
+            flipped[begin + 1 + bit // 8] ^= 1 << bit % 8
+            file.write_bytes(flipped)
+            with Recording(file) as recording:
+                assert content(recording) == expected, (opcode, begin, bit)
+                assert any("length" in loss.what for loss in recording.losses)

@@ -7,7 +7,7 @@ from microdrivers.configs import shipped_rig
 from microdrivers.core.bus import Bus
 from microdrivers.core.clock import SimulatedClock, utc_now
 from microdrivers.core.errors import ConfigError, UnsupportedError
-from microdrivers.core.samples import Frame, XYThetaSample
+from microdrivers.core.samples import Frame, XYThetaSample, ZoomSample
 from microdrivers.estimators.force.identify import IdentificationSettings
 from microdrivers.estimators.optics.calibrator import CalibratorSettings
 from microdrivers.recording.header import describe_recording
@@ -172,6 +172,15 @@ def test_a_calibration_at_another_zoom_than_the_recorded_run_had_is_not_complete
     assert [row[name] for name in ("doubtful", "complete", "losses")] == [True, False, 0]
     assert (row["missing"], row["frames"] + row["lost_frames"]) == (34, 60)
     assert "this is the calibration at zoom 0.8999" in row["notes"]
+
+
+def test_frames_after_the_last_zoom_reading_cannot_be_used_and_the_result_says_so(calibrated, tmp_path):
+    run, file = calibrated
+    last_ns = run.estimates[24].t_ns
+    copy = without(file, tmp_path / "run.mcap", lambda s: isinstance(s, ZoomSample) and s.t_ns > last_ns + 20_000_000)
+    row = analyse_recording(str(copy))
+    assert [row[name] for name in ("doubtful", "complete", "frames", "unmatched_frames")] == [True, False, 25, 35]
+    assert "No pose or no zoom reading came after the last 35 frames of the run" in row["notes"]
 
 
 def test_poses_that_a_recording_lacks_make_its_figures_doubtful(calibrated, tmp_path):

@@ -35,6 +35,7 @@ class OpticsRun(NamedTuple):
     Attributes:
         complete: False if it was interrupted.
         estimates: one a matched frame.
+        waiting_frames: of a run that ended as planned, the last ones, after which no pose or no zoom reading came.
         arrivals: bus-wide order numbers in the order in which the estimator saw the samples.
         recorded: those samples, if asked for.
         past_run: what a recording tells of its run.
@@ -46,6 +47,7 @@ class OpticsRun(NamedTuple):
     estimates: list[OpticsEstimate]
     lost_frames: int
     unmatched_frames: int
+    waiting_frames: int
     settings: CalibratorSettings
     optics: Optics
     arrivals: list[int]
@@ -127,6 +129,7 @@ def calibrate_optics(
         estimates=estimates,
         lost_frames=sum(calibrator.lost_frames for calibrator in calibrators),
         unmatched_frames=sum(calibrator.unmatched_frames for calibrator in calibrators),
+        waiting_frames=0 if ended_by else sum(calibrator.waiting_frames for calibrator in calibrators),
         settings=settings,
         optics=source.optics(),
         arrivals=[order for host in hosts for order in host.inbox.arrivals],
@@ -143,11 +146,12 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         IllConditioned: the run does not determine a calibration; the message says what was missing.
     """
     lost_frames = run.lost_frames + run.past_run.lost_frames
+    unmatched_frames = run.unmatched_frames + run.waiting_frames
     choice = choose_estimate(
         run.estimates,
         pixel_pitch_um=run.optics.pixel_pitch_um,
         lost_frames=lost_frames,
-        unmatched_frames=run.unmatched_frames,
+        unmatched_frames=unmatched_frames,
     )
     final, parameters = choice.estimate, choice.parameters
     outdated = choice.frames_since_change > 0 or _changed_unseen(run)
@@ -155,7 +159,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
     pitch_um = run.optics.pixel_pitch_um
     scales = _trace([e.scale_px_per_um for e in run.estimates])
     return OpticsResult(
-        complete=run.complete and not run.past_run.ended_by and not outdated,
+        complete=run.complete and not (run.past_run.ended_by or run.waiting_frames or outdated),
         projection=(p[:3], p[3:]),
         scale_px_per_um=parameters.scale_px_per_um,
         scale_sigma_px_per_um=parameters.sigma_scale_px_per_um or 0.0,
@@ -178,7 +182,7 @@ def build_result(run: OpticsRun, provenance: Provenance, truth: Truth | None = N
         zoom_change=None if outdated else zoom_change(run.estimates),
         frames=len(run.estimates),
         lost_frames=lost_frames,
-        unmatched_frames=run.unmatched_frames,
+        unmatched_frames=unmatched_frames,
         valid_for=ValidFor(
             camera=run.optics.camera,
             binning=run.optics.binning,
@@ -264,6 +268,11 @@ def _notes(run: OpticsRun, choice: Choice) -> list[str]:
     notes += run.past_run.notes()
     if run.lost_frames:
         notes.append(f"The target was not found in {_frames(run.lost_frames)}.")
+    if run.waiting_frames:
+        notes.append(
+            f"No pose or no zoom reading came after the last {_frames(run.waiting_frames)} of the run, which could not "
+            "be used."
+        )
     if run.unmatched_frames:
         notes.append(f"{_frames(run.unmatched_frames)} had no pose close enough before and after.")
     if run.optics.pixel_pitch_um is None:
