@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from microdrivers.core.errors import UnsupportedError
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import Note
 
@@ -68,3 +69,22 @@ def past_run(
     frames = f", among them {lost_frames} frame{'s' * (lost_frames > 1)} of the experiment" if lost_frames else ""
     lacks = [f"it lacks {missing} sample{'s' * (missing > 1)} that the estimators had{frames}"] if missing else []
     return PastRun(ended_by, (*lacks, *recording.flaws), missing, lost_frames, lost_last)
+
+
+def refuse_unbegun(recording: Recording, notes: Sequence[Note], done: str) -> None:
+    """Refuse a run that ended before anything was measured.
+
+    Args:
+        recording: of the run.
+        notes: of its routine.
+        done: kind of the routine's note of its end.
+
+    Raises:
+        UnsupportedError: there is such a note, and nothing of the file is damaged.
+    """
+    ended = [note.content["ended_by"] for note in notes if note.kind == done]
+    if ended and ended[-1] and not recording.losses:
+        raise UnsupportedError(
+            f"the run that {recording.file} holds ended before anything was measured: {ended[-1]}",
+            remedy="there is nothing to analyse: run it again",
+        )

@@ -23,6 +23,7 @@ from microdrivers.routines.force import (
     build_result,
 )
 from microdrivers.routines.force.source import READY
+from microdrivers.routines.notes import note
 from microdrivers.routines.optics import CircleExperiment, CircleSettings, OpticsReplay, calibrate_optics
 from microdrivers.routines.optics.calibration import build_result as build_optics_result
 from microdrivers.routines.progress import SilentProgress
@@ -257,6 +258,16 @@ def test_a_recording_without_a_calibration_is_refused(tmp_path):
         bus.topic("stage", XYThetaSample)
     for source in (OpticsReplay, IndentationReplay):
         with Recording(tmp_path / "a.mcap") as recording, pytest.raises(UnsupportedError, match="holds no"):
+            source(recording)
+
+
+def test_a_run_that_was_interrupted_before_it_measured_is_called_so(tmp_path):
+    clock, bus = SimulatedClock(), Bus()
+    with Recorder(tmp_path / "a.mcap", bus=bus, clock=clock, header=describe_recording(source="fake")):
+        for kind in ("optics/done", "force/done"):
+            note(bus, clock, kind, {"ended_by": "it was interrupted"})
+    for source in (OpticsReplay, IndentationReplay):
+        with Recording(tmp_path / "a.mcap") as recording, pytest.raises(UnsupportedError, match="it was interrupted"):
             source(recording)
 
 

@@ -26,7 +26,7 @@ from microdrivers.routines.force.source import (
     Rests,
     host_name,
 )
-from microdrivers.routines.past_run import PastRun, past_run
+from microdrivers.routines.past_run import PastRun, past_run, refuse_unbegun
 from microdrivers.routines.progress import Progress
 
 
@@ -46,6 +46,7 @@ class IndentationReplay:
         notes = notes_of(recording)
         ready = [note for note in notes if note.kind == READY]
         if not ready:
+            refuse_unbegun(recording, notes, DONE)
             raise UnsupportedError(
                 f"{recording.file} holds no force characterisation",
                 remedy="give the run.mcap of `calibrate force`; `microdrivers info` tells what a file holds",

@@ -14,7 +14,7 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
 from microdrivers.routines.optics.source import BEGIN, DONE, HOST, SETTINGS, Optics, SourceNames, frames_taken
 from microdrivers.routines.optics.targets import make_tracker
-from microdrivers.routines.past_run import PastRun, past_run
+from microdrivers.routines.past_run import PastRun, past_run, refuse_unbegun
 from microdrivers.routines.progress import Progress
 
 
@@ -133,6 +133,7 @@ def _beginning(recording: Recording, notes: Sequence[Note]) -> Note:
             remedy="give another copy of the file; `microdrivers export` gives what is intact of its samples",
         )
     if not beginnings:
+        refuse_unbegun(recording, notes, DONE)
         raise UnsupportedError(
             f"{recording.file} holds no optical calibration",
             remedy="give the run.mcap of `microdrivers calibrate optics`; `microdrivers info` tells what a file holds",
