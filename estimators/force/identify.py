@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -142,7 +141,7 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     best = _best(protocols)
     protocols = _rivals_marked(protocols, best)
     if best == "slip_corrected":
-        protocols[best] = _with_weak(protocols[best], _hidden_by_slip(prepared, fits[best], protocols[best]))
+        protocols[best] = protocols[best].with_weak(_hidden_by_slip(prepared, fits[best], protocols[best]))
     slip = _slip(prepared, protocols, best)
     notes = notes_on(record, prepared, both_ways=both_ways)
     if settings.protocol not in {None, best}:
@@ -175,6 +174,8 @@ def _rivals_marked(
     marked = dict(protocols)
     least = min((fit.likelihood_cost for fit in protocols.values() if _explains(fit)), default=math.inf)
     for one, other in itertools.permutations(protocols.values(), 2):
+        if not _may_be_slip(other):
+            continue
         likely = _explains(other) and other.likelihood_cost <= least + _AS_LIKELY
         if not (likely if _explains(one) else other.name == best and _explains(other)):
             continue
@@ -185,14 +186,13 @@ def _rivals_marked(
             its, its_sigma = other.springs_and_damper[name]
             if _is_ruled_out(one, other) or abs(mine - its) > _APART * math.hypot(my_sigma, its_sigma):
                 weak[name] = f"{other.name} explains {how} with {its:.3g}"
-        marked[one.name] = _with_weak(marked[one.name], weak)
+        marked[one.name] = marked[one.name].with_weak(weak)
     return marked
 
 
-def _with_weak(fit: ProtocolFit, more: Mapping[str, str]) -> ProtocolFit:
-    """A fit with more reasons why parameters are not determined."""
-    weak = {**fit.weak, **{name: "; ".join(filter(None, (fit.weak.get(name), why))) for name, why in more.items()}}
-    return dataclasses.replace(fit, weak=weak, identifiable={name: name not in weak for name in fit.identifiable})
+def _may_be_slip(fit: ProtocolFit) -> bool:
+    """Whether the slip that a protocol has found can be one, however imprecise; true of one without a slip."""
+    return {"slip", "slip_rate"} & set(fit.weak) <= fit.imprecise
 
 
 def _hidden_by_slip(prepared: Prepared, fit: Fit, slipped: ProtocolFit) -> dict[str, str]:
@@ -238,9 +238,9 @@ def _best(protocols: Mapping[ProtocolName, ProtocolFit]) -> ProtocolName:
 
 def _slip_counts(slipped: ProtocolFit, without: Sequence[ProtocolFit]) -> bool:
     """Whether a slip may explain a record: it is one, and determined or beyond doubt."""
-    weak = {"slip", "slip_rate"} & set(slipped.weak)
-    if not weak <= slipped.imprecise:
+    if not _may_be_slip(slipped):
         return False
+    weak = {"slip", "slip_rate"} & set(slipped.weak)
     clearly = slipped.error_percent <= _CLEARLY * min(fit.error_percent for fit in without)
     return not weak or clearly or (slipped.within_noise and not any(fit.within_noise for fit in without))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -116,6 +117,14 @@ class ProtocolFit:
             "k2": (self.k2_uN_per_um3, self.sigma_k2_uN_per_um3),
             "b": (self.b_loading_uN_s_per_um, self.sigma_b_uN_s_per_um),
         }
+
+    def with_weak(self, more: Mapping[str, str]) -> ProtocolFit:
+        """The same with more reasons why parameters are not determined, by name."""
+        weak = {
+            **self.weak,
+            **{name: "; ".join(filter(None, (self.weak.get(name), why))) for name, why in more.items()},
+        }
+        return dataclasses.replace(self, weak=weak, identifiable={name: name not in weak for name in self.identifiable})
 
     def model(self) -> SpecimenModel:
         """What reading force from the camera needs."""

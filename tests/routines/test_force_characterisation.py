@@ -137,6 +137,18 @@ def test_a_slip_that_the_approach_has_used_up_in_part_is_not_quoted(tmp_path, sp
     assert bool(slip.reason) == bool(why)
 
 
+def test_nothing_is_determined_where_the_sensor_was_tared_in_contact(tmp_path):
+    run = Characterisation(IndentationPlayback(IndentationTable(REAL))).run()
+    assert run.identification.contact.seen == "nothing"
+    for touch_uN, live in ((None, False), (1.0, True)):
+        result = result_of(run._replace(setup=run.setup._replace(touch_uN=touch_uN)))
+        told = [
+            fit.identifiable.reasons.get("k1", "").endswith("zero was taken there") for fit in result.protocols.values()
+        ]
+        assert told == [live] * len(told)
+        assert any(note.startswith("Nothing is determined") for note in result.notes) == live
+
+
 def test_a_surface_that_lies_elsewhere_than_the_contact_that_was_felt_is_said(characterised):
     _, run, result, _ = characterised
     pressed = [

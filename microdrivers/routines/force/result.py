@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from microdrivers.core.contact_samples import IndentationSample, VisionForceSample
 from microdrivers.core.errors import MicrodriversError
+from microdrivers.core.protocol_names import ProtocolName
 from microdrivers.core.units import NS_PER_S
 from microdrivers.devices.force_sensor import SATURATED
 from microdrivers.estimators.force.motion_limit import speed_limit
@@ -45,6 +46,8 @@ _USED_UP = 0.03
 _SURFACE_UM = 3.0
 """Farther than this from where the approach felt a contact, the surface lies elsewhere."""
 
+_TARED_IN_CONTACT = "the probe still pressed when it had gone back, and the sensor's zero was taken there"
+
 _LEFT = 0.5
 """Of the camera's force: what the sensor feels less than, of a specimen that has been let go."""
 
@@ -52,7 +55,8 @@ _LEFT = 0.5
 def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
     """All that was found, with what it is valid for."""
     found = run.identification
-    best = found.protocols[found.best]
+    protocols = _trusted(run)
+    best = protocols[found.best]
     check = compare(run.check) if run.check is not None else None
     borne_uN = run.record.force_uN - found.baseline_uN
     largest_uN = float(np.nanmax(np.where(saturated(run.record), np.nan, borne_uN)))
@@ -63,7 +67,7 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
             deformation_um=best.contact_um,
             deformation_sigma_um=_known(best.sigma_contact_um),
         ),
-        protocols={name: _protocol(fit, _relative_scale_sigma(run.setup)) for name, fit in found.protocols.items()},
+        protocols={name: _protocol(fit, _relative_scale_sigma(run.setup)) for name, fit in protocols.items()},
         best=found.best,
         slip=_slip(run),
         misfit=Misfit(
@@ -84,6 +88,19 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
         notes=_notes(run, check),
         provenance=provenance,
     )
+
+
+def _trusted(run: ForceRun) -> Mapping[ProtocolName, ProtocolFit]:
+    """The protocols; nothing is determined by a press that began in contact, for the sensor was tared there."""
+    protocols = run.identification.protocols
+    if not _began_in_contact(run):
+        return protocols
+    return {name: fit.with_weak(dict.fromkeys(fit.identifiable, _TARED_IN_CONTACT)) for name, fit in protocols.items()}
+
+
+def _began_in_contact(run: ForceRun) -> bool:
+    """Whether the probe of a rig still pressed when it had gone back from the touch."""
+    return run.setup.touch_uN is not None and run.identification.contact.seen == "nothing"
 
 
 def compare(check: Indentation) -> VisionCheck | None:
@@ -162,7 +179,7 @@ def _slip(run: ForceRun) -> SlipFit | None:
         return None
     drifted_um = 0.0 if drift is None else drift.sigma_um_s * found.contact_duration_s
     scaled_um = _relative_scale_sigma(run.setup) * slip.offset_um
-    used_up = _used_up(run)
+    used_up = "" if slip.reason else _used_up(run)
     return SlipFit(
         offset_um=slip.offset_um,
         offset_sigma_um=_known(math.hypot(slip.sigma_offset_um, drifted_um, scaled_um)),
@@ -170,7 +187,7 @@ def _slip(run: ForceRun) -> SlipFit | None:
         rate_sigma_per_s=_known(slip.sigma_rate_per_s),
         not_returned_um=slip.not_returned_um,
         identifiable=slip.identifiable and not used_up,
-        reason="; ".join(filter(None, (slip.reason, used_up))),
+        reason=slip.reason or used_up,
     )
 
 
@@ -284,7 +301,12 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
             f"The model does not explain the record as fitted by {', '.join(beyond)}: do not quote its numbers."
         )
     ahead_um = surface_ahead_um(run.first.deformations) if run.setup.touch_uN is not None else None
-    if ahead_um is not None and abs(ahead_um) > _SURFACE_UM:
+    if _began_in_contact(run):
+        notes.append(
+            f"Nothing is determined: {_TARED_IN_CONTACT}. A faster approach, or a sensor with less noise, feels the "
+            "specimen earlier."
+        )
+    elif ahead_um is not None and abs(ahead_um) > _SURFACE_UM:
         notes.append(
             f"The camera shows the surface {abs(ahead_um):.3g} µm {'beyond' if ahead_um > 0.0 else 'before'} where the "
             "approach felt a contact: the specimen was pressed less or more deeply than asked for by as much."

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from microdrivers.core.errors import DataError, NoContact
-from microdrivers.estimators.force.identify import IdentificationSettings, identify
+from microdrivers.estimators.force.identify import IdentificationSettings, _rivals_marked, identify
 from microdrivers.estimators.force.model import force_uN, slip_speed_um_s, slipped_um
 from microdrivers.estimators.force.selection import all_protocols, settled
 from microdrivers.estimators.force.trajectory import RAMP
@@ -536,3 +536,17 @@ def test_a_zero_of_the_sensor_is_taken_off_and_told():
     assert found.baseline_uN == pytest.approx(np.full(len(record.time_s), 20.0), abs=0.1)
     assert any(note.startswith("the force is 20 µN out of contact") for note in found.notes)
     assert not any("out of contact" in note for note in identified("single").notes)
+
+
+@pytest.mark.parametrize(
+    ("weak", "imprecise", "counts"), [("it has not slipped", (), False), ("wide", ("slip",), True)]
+)
+def test_a_slip_that_cannot_be_one_is_no_rival(weak, imprecise, counts):
+    fits = {name: identify(recorded("single")).protocols[name] for name in ("single", "slip_corrected")}
+    single = fits["single"]
+    assert single.identifiable["k1"]
+    fits["slip_corrected"] = dataclasses.replace(
+        fits["slip_corrected"], within_noise=True, likelihood_cost=single.likelihood_cost, weak={"slip": weak},
+        k1_uN_per_um=1.1 * single.k1_uN_per_um, imprecise=frozenset(imprecise),
+    )  # fmt: skip
+    assert _rivals_marked(fits, "single")["single"].identifiable["k1"] == (not counts)
