@@ -46,12 +46,14 @@ class MotionSettings(NamedTuple):
         window: positions in a fit. 2·lag − 1 makes it symmetric, so that the velocity is that of its own instant; with
             a shorter lag it is that of `(window + 1)/2 − lag` positions before.
         with_acceleration: fit parabolas.
+        with_lateness: find `late_um_s`, which is 0 otherwise.
         max_gap_s: positions further apart than this belong to different motions.
     """
 
     lag: int = 9
     window: int = 17
     with_acceleration: bool = False
+    with_lateness: bool = False
     max_gap_s: float = 0.25
 
 
@@ -153,7 +155,7 @@ class LocalMotion:
         motions = self._push(self._newest[-1], spike=False) if self._unscreened else []
         self._unscreened = False
         if self._pending:
-            motions += self._settle(len(self._pending), self._points, self._count + _FAR)
+            motions += self._settle(len(self._pending), self._fit(self._points), self._points, self._count + _FAR)
         return motions
 
     def _begin_anew(self) -> None:
@@ -188,28 +190,30 @@ class LocalMotion:
             self._points.append(Point(t_s, x_um))
         if not self._points:
             return motions
-        line, fitted = self._fit(self._points), [*self._points]
+        fitted: Sequence[Point] = self._points
+        line = self._fit(fitted)
         least_um2 = _CORNER * sigma_um * sigma_um
         if line.left_um2 >= least_um2 and len(self._points) >= _BEFORE + self._beyond:
             at = self._suspect(line, least_um2)
             if at < len(self._points) - self._beyond:
                 motions = self._turn_near(line, at, least_um2)
-                fitted = [*self._points]
+                line = self._fit(fitted)
             elif at < len(self._points) and self._bends(at):
-                fitted = fitted[: at + 1]
-        self._speed_um_s = abs(self._fit(fitted).slope)
+                fitted = [*self._points][: at + 1]
+                line = self._fit(fitted)
+        self._speed_um_s = abs(line.slope)
         surplus = len(self._pending) - (self.settings.lag - 1)
         if surplus > 0:
-            motions += self._settle(surplus, fitted, self._count + _FAR)
+            motions += self._settle(surplus, line, fitted, self._count + _FAR)
         return motions
 
     def _fit(self, points: Sequence[Point]) -> LineFit:
         return fit(points, parabola=self.settings.with_acceleration)
 
-    def _settle(self, count: int, points: Sequence[Point], corner_rank: int) -> list[InstantMotion]:
-        """Tell the oldest pending positions by these points; the next corner lies before the one with `corner_rank`."""
+    def _settle(self, count: int, line: LineFit, points: Sequence[Point], corner_rank: int) -> list[InstantMotion]:
+        """Tell the oldest pending positions by the line through these points; the next corner has `corner_rank`."""
         motions = []
-        line, half = self._fit(points), fit([*points][-max(2, len(points) // 2) :])
+        half = fit([*points][-max(2, len(points) // 2) :]) if self.settings.with_lateness else line
         for _ in range(count):
             t_ns, t_s, x_um, sigma_um, rank, spike, corner_um_s = self._pending.popleft()
             clearance = corner_rank - 1 - rank
@@ -278,7 +282,7 @@ class LocalMotion:
         self._points.extend(new)
         past = sum(position.t_s <= corner_s for position in self._pending)
         corner_rank = self._pending[past].rank
-        motions = self._settle(past, old, corner_rank)
+        motions = self._settle(past, line, old, corner_rank)
         self._pending = deque(p._replace(rank=p.rank - corner_rank) for p in self._pending)
         self._count -= corner_rank
         self._begin_ns = self._zero_ns + round((new[0].t_s if jump else corner_s) * NS_PER_S)

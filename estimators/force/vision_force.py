@@ -77,7 +77,12 @@ class VisionForce:
         self.device = device
         self.late_frames = 0
         self._motion = LocalMotion(
-            MotionSettings(lag=self.settings.lag, window=self.settings.window, max_gap_s=self.settings.max_gap_s)
+            MotionSettings(
+                lag=self.settings.lag,
+                window=self.settings.window,
+                with_lateness=True,
+                max_gap_s=self.settings.max_gap_s,
+            )
         )
         self._lag = _Lag(self.settings.window)
         self._waiting: deque[DeformationSample] = deque()

@@ -175,12 +175,14 @@ def test_a_position_at_a_corner_may_be_of_either_speed(at: float, known: bool) -
 def test_what_changes_within_the_window_shows_beyond_noise_alone() -> None:
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
+    asked = SHORT._replace(with_lateness=True)
     noise = 0.02 * rng.standard_normal(len(t))
-    steady = told(LocalMotion(SHORT), t, 5.0 * t + noise, sigma_um=0.02)
+    steady = told(LocalMotion(asked), t, 5.0 * t + noise, sigma_um=0.02)
     assert np.mean([m.late_um_s > 0.0 for m in steady]) < 0.02
-    quickens = told(LocalMotion(SHORT), t, 5.0 * t + 1.5 * t * t + noise, sigma_um=0.02)
+    quickens = told(LocalMotion(asked), t, 5.0 * t + 1.5 * t * t + noise, sigma_um=0.02)
     late = np.array([m.late_um_s for m in quickens[30:]])
     assert np.median(late) == pytest.approx(3.0 * 5.0 / RATE_HZ, rel=0.2)
+    assert not any(m.late_um_s for m in told(LocalMotion(SHORT), t, 5.0 * t + 1.5 * t * t + noise, sigma_um=0.02))
 
 
 @settings(deadline=None, max_examples=20)
