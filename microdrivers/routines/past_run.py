@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from inspect import signature
+from typing import NamedTuple, TypeVar
 
 from microdrivers.core.errors import UnsupportedError
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import Note
 
 _MOST_FLAWS = 8
+
+SettingsT = TypeVar("SettingsT")
 _LACKS_END = "the recording does not hold its end"
 
 
@@ -69,6 +72,22 @@ def past_run(
     frames = f", among them {lost_frames} frame{'s' * (lost_frames > 1)} of the experiment" if lost_frames else ""
     lacks = [f"it lacks {missing} sample{'s' * (missing > 1)} that the estimators had{frames}"] if missing else []
     return PastRun(ended_by, (*lacks, *recording.flaws), missing, lost_frames, lost_last)
+
+
+def noted_settings(
+    notes: Sequence[Note], kind: str, settings: Callable[..., SettingsT], *, before: Note
+) -> SettingsT | None:
+    """What the run's estimators were set to, settings left out that are not known any more; None if it does not tell.
+
+    Args:
+        notes: of its routine.
+        kind: of the notes of its settings; the last of them counts.
+        settings: their type.
+        before: a later note does not belong to the run.
+    """
+    noted = [note.content for note in notes if note.kind == kind and note.order < before.order]
+    known = signature(settings).parameters
+    return settings(**{name: value for name, value in noted[-1].items() if name in known}) if noted else None
 
 
 def refuse_unbegun(recording: Recording, notes: Sequence[Note], done: str) -> None:

@@ -26,7 +26,7 @@ from microdrivers.routines.force.source import (
     Rests,
     host_name,
 )
-from microdrivers.routines.past_run import PastRun, past_run, refuse_unbegun
+from microdrivers.routines.past_run import PastRun, noted_settings, past_run, refuse_unbegun
 from microdrivers.routines.progress import Progress
 
 
@@ -52,7 +52,7 @@ class IndentationReplay:
                 remedy="give the run.mcap of `calibrate force`; `microdrivers info` tells what a file holds",
             )
         self._ready = ready[-1]
-        self._settings = [note for note in notes if note.kind == SETTINGS and note.order < self._ready.order]
+        self.past_settings = noted_settings(notes, SETTINGS, IdentificationSettings, before=self._ready)
         self._begins = [note for note in notes if note.kind == BEGIN and note.order > self._ready.order]
         self._ends = [note for note in notes if note.kind == END and note.order > self._ready.order]
         self._done = [note for note in notes if note.kind == DONE and note.order > self._ready.order]
@@ -121,14 +121,6 @@ class IndentationReplay:
         begun = [note.order for note in self._begins[number - 1 : number + 1]]
         own = [note for note in self._ends if begun and begun[0] < note.order and not note.order > begun[-1] > begun[0]]
         return own[0] if own else None
-
-    @property
-    def past_settings(self) -> IdentificationSettings | None:
-        """As they were; a setting that is not known any more is left out."""
-        if not self._settings:
-            return None
-        noted = self._settings[-1].content
-        return IdentificationSettings(**{name: noted[name] for name in IdentificationSettings._fields if name in noted})
 
     @property
     def past_run(self) -> PastRun:

@@ -14,7 +14,7 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.replay import FRAME_HISTORY, Note, Replay, notes_of
 from microdrivers.routines.optics.source import BEGIN, DONE, HOST, SETTINGS, Optics, SourceNames, frames_taken
 from microdrivers.routines.optics.targets import make_tracker
-from microdrivers.routines.past_run import PastRun, past_run, refuse_unbegun
+from microdrivers.routines.past_run import PastRun, noted_settings, past_run, refuse_unbegun
 from microdrivers.routines.progress import Progress
 
 
@@ -41,7 +41,7 @@ class OpticsReplay:
         self._recording = recording
         notes = notes_of(recording)
         self._beginning = _beginning(recording, notes)
-        self._settings = [note for note in notes if note.kind == SETTINGS and note.order < self._beginning.order]
+        self.past_settings = noted_settings(notes, SETTINGS, CalibratorSettings, before=self._beginning)
         self._done = [note for note in notes if note.kind == DONE and note.order > self._beginning.order]
         taken: int | None = self._beginning.content["frames_expected"]
         self._frames_expected = frames if taken is None else frames_taken(frames, taken, source=str(recording.file))
@@ -85,14 +85,6 @@ class OpticsReplay:
         return past_run(
             self._recording, self._done, missing=self._replay.missing, lost_frames=lost, lost_last=self._lost_last
         )
-
-    @property
-    def past_settings(self) -> CalibratorSettings | None:
-        """As they were; a setting that is not known any more is left out."""
-        if not self._settings:
-            return None
-        noted = self._settings[-1].content
-        return CalibratorSettings(**{name: noted[name] for name in CalibratorSettings._fields if name in noted})
 
     def _admit(self, topic: str, sample: Sample) -> bool:
         """Count the run's frames, and those that the recording lacks; no later one takes the place of a lost one."""
