@@ -29,6 +29,8 @@ from microdrivers.routines.progress import SilentProgress
 from tests.routines.small_rig import SHORT, small_rig
 
 AWAY_UM, RETRACT_UM = 300.0, 400.0
+SETTLED_S = 0.1
+"""So long after a force has gone the sensor, which lags, reads none: a tare may begin."""
 
 
 @pytest.fixture(scope="module")
@@ -331,6 +333,7 @@ def test_a_force_that_stays_when_the_tool_goes_back_is_no_contact(rig):
             world.pressed["probe_force"] = lambda t_ns: 30.0 if t_ns > since_ns else 0.0
         elif text.startswith("no contact after"):
             world.pressed.clear()
+            rig.clock.sleep(SETTLED_S)
 
     steps = SilentProgress()
     steps.step = step
@@ -347,12 +350,16 @@ def test_false_contacts_that_come_no_farther_are_given_up(rig):
     """Each tare is followed by a force that begins at once: where the specimen is cannot be told."""
     world = rig.simulation.world
 
-    def bend(_text=None):
-        since_ns = rig.clock.now_ns() + round(0.35 * NS_PER_S)
+    def step(text):
+        if not text.startswith(("approach until", "no contact after")):
+            return
+        world.pressed.clear()
+        rig.clock.sleep(SETTLED_S)
+        since_ns = rig.clock.now_ns() + round((SHORT.tare_s + 0.15) * NS_PER_S)
         world.pressed["probe_force"] = lambda t_ns: 30.0 if t_ns > since_ns else 0.0
 
     steps = SilentProgress()
-    steps.step = lambda text: bend() if text.startswith(("approach until", "no contact after")) else None
+    steps.step = step
     _, error = run(rig, steps=steps)
     assert isinstance(error, DataError)
     assert not isinstance(error, NoContact)
