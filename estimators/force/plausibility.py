@@ -38,8 +38,8 @@ def doubts(prepared: Prepared) -> list[str]:
     if rise_uN < SOFT_UN_PER_UM * depth_um:
         found.append(
             f"units in doubt: {rise_uN:.3g} µN over {depth_um:.3g} µm, from the loading's first sample to its last, is "
-            f"{rise_uN / depth_um:.2g} µN/µm, and held embryos have 3 to 6 µN/µm; if the force column was in mN, "
-            "multiply it by 1000 and start again"
+            f"{rise_uN / depth_um:.2g} µN/µm, and held embryos have 3 to 6 µN/µm; if the forces were in mN, "
+            "multiply them by 1000 (a table's column, or the sensor's scale in the rig file) and start again"
         )
     if speed_um_s > FAST_UM_S:
         found.append(

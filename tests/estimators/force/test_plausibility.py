@@ -23,7 +23,7 @@ def test_what_the_paper_has_is_not_doubted():
 def test_a_force_in_mN_is_doubted():
     record = shallow()
     (note,) = told(record._replace(force_uN=record.force_uN / 1e3, force_sigma_uN=0.0))
-    assert "if the force column was in mN, multiply it by 1000" in note
+    assert "if the forces were in mN, multiply them by 1000" in note
     assert "held embryos have 3 to 6 µN/µm" in note
 
 
