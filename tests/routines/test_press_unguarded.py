@@ -24,6 +24,8 @@ from microdrivers.routines.force import Characterisation, PressExperiment
 from microdrivers.routines.progress import SilentProgress
 from tests.routines.small_rig import SHORT, small_rig
 
+pytestmark = pytest.mark.xdist_group("two prepared probes")
+
 AWAY_UM = 300.0
 STALE_S, BRAKING_UM = 0.15, 1.0
 SILENT = "no reading has come from probe_force for "
