@@ -1,6 +1,7 @@
 """The serial line on ports of the operating system: whose bytes are whose, and what happens when the port goes."""
 
 import os
+import select
 import socket
 import threading
 import tty
@@ -24,18 +25,20 @@ pytestmark = pytest.mark.xdist_group("real_time")
 class Far:
     """The other end of a port; answers each write with the next of `replies`, if there is one."""
 
-    def __init__(self, port, read, write, close):
+    def __init__(self, port, source, read, write, hang_up):
         self.port = port
         self.replies = []
         self.heard = b""
         self.write = write
-        self.close = close
-        self._read = read
+        self._source, self._read, self._hang_up = source, read, hang_up
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
     def _serve(self):
-        while True:
+        while not self._closing.is_set():
+            if not select.select([self._source()], [], [], 0.01)[0]:
+                continue
             try:
                 data = self._read(65536)
             except OSError:
@@ -46,33 +49,42 @@ class Far:
             if self.replies:
                 self.write(self.replies.pop(0))
 
+    def close(self):
+        """Nobody may read on: the next port gets the same descriptors."""
+        self._closing.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+        self._hang_up()
+
 
 def pseudo_terminal():
     master, slave = os.openpty()
     tty.setraw(slave)
-    far = Far(os.ttyname(slave), lambda size: os.read(master, size), lambda data: os.write(master, data), None)
-    far.close = lambda: (os.close(slave), os.close(master))
-    return far
+    return Far(
+        os.ttyname(slave), lambda: master, lambda size: os.read(master, size), lambda data: os.write(master, data),
+        lambda: (os.close(slave), os.close(master)),
+    )  # fmt: skip
 
 
 def tcp():
     listener = socket.create_server(("127.0.0.1", 0))
-    connected = threading.Event()
     held = []
 
     def read(size):
         if not held:
             held.append(listener.accept()[0])
-            connected.set()
         return held[0].recv(size)
 
-    def close():
-        connected.wait(5)
-        held[0].close()
+    def hang_up():
+        if held:
+            held[0].close()
         listener.close()
 
     host, port = listener.getsockname()
-    return Far(f"socket://{host}:{port}", read, lambda data: held[0].sendall(data), close)
+    return Far(
+        f"socket://{host}:{port}", lambda: held[0] if held else listener, read, lambda data: held[0].sendall(data),
+        hang_up,
+    )  # fmt: skip
 
 
 def whole(reply):
