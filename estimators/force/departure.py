@@ -98,19 +98,27 @@ def _most_likely(force: Array, sigma: float) -> Departure | None:
     splits = np.arange(_FEWEST, len(values) - _FEWEST_RISING + 1)
     if not len(splits):
         return None
-    misfit = np.array([_constant_misfit(values[:at]) + _line_misfit(values[at:]) for at in splits])
+    to_line = _line_misfits(values)
+    misfit = _constant_misfits(values)[splits] + to_line[splits]
     as_well = misfit.min() + _LIKELY * max(sigma**2, misfit.min() / len(values))
-    if _line_misfit(values) < as_well:
+    if to_line[0] < as_well:
         return None
     likely = splits[misfit < as_well]
     return Departure(int(likely[0]), int(likely[-1]))
 
 
-def _constant_misfit(values: Array) -> float:
-    return float(np.sum((values - values.mean()) ** 2))
+def _constant_misfits(values: Array) -> Array:
+    """Sum of squares about their mean, of the first 0, 1, … values; of none and of one 0."""
+    n = np.arange(len(values) + 1)
+    total, squares = (np.concatenate([[0.0], np.cumsum(column)]) for column in (values, values**2))
+    return np.asarray(squares - total**2 / np.maximum(n, 1))
 
 
-def _line_misfit(values: Array) -> float:
-    t = np.arange(len(values)) - (len(values) - 1) / 2.0
-    off = values - values.mean()
-    return float(off @ off - (t @ off) ** 2 / (t @ t))
+def _line_misfits(values: Array) -> Array:
+    """Sum of squares about their straight line, of the values from the first, the second, … on; of fewer than two 0."""
+    length = len(values)
+    n = length - np.arange(length)
+    t = np.arange(length, dtype=np.float64)
+    total, squares, moment = (np.cumsum(column[::-1])[::-1] for column in (values, values**2, t * values))
+    slant = moment - (t + (n - 1) / 2.0) * total
+    return np.asarray(squares - total**2 / n - slant**2 / np.maximum(n * (n**2 - 1.0) / 12.0, 1.0))
