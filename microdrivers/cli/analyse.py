@@ -15,8 +15,8 @@ from microdrivers.cli.progress import TerminalProgress
 @click.argument("runs", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Parallel processes.")
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="TABLE", default=Path("analysis.csv"), show_default=True,
-    help="New table, .csv or .parquet.",
+    "--out", type=click.Path(dir_okay=False, path_type=Path), metavar="TABLE", default=Path("analysis.csv"),
+    show_default=True, help="New table, .csv or .parquet.",
 )  # fmt: skip
 @click.option("--dask", metavar="ADDRESS", help="A Dask scheduler instead of processes, such as tcp://10.0.0.5:8786.")
 def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> None:
@@ -33,8 +33,11 @@ def analyse(runs: tuple[Path, ...], jobs: int, out: Path, dask: str | None) -> N
       microdrivers analyse monday/*.mcap --out monday.parquet
       microdrivers analyse runs/ --dask tcp://10.0.0.5:8786
     """
+    from microdrivers.core.errors import ConfigError
     from microdrivers.routines.analysis import analyse_recordings, doubts, find_recordings
 
+    if dask is not None and jobs != 1:
+        raise ConfigError("--jobs and --dask exclude each other", remedy="the cluster has its own workers: omit --jobs")
     files = find_recordings(runs)
     progress = TerminalProgress()
     progress.step(_recordings(len(files)))

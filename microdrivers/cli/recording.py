@@ -11,8 +11,11 @@ from microdrivers.cli.exit_codes import EXIT_ERROR
 
 
 @click.command(short_help="Make a torn or damaged recording readable by any MCAP tool.")
-@click.argument("file", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE2", help="New file; default: FILE.repaired.mcap.")
+@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--out", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE2",
+    help="New file; default: FILE.repaired.mcap.",
+)  # fmt: skip
 def repair(file: Path, out: Path | None) -> None:
     """Write all of FILE that is intact to a new file, which any MCAP reader reads. FILE stays as it is.
 
@@ -39,8 +42,10 @@ def repair(file: Path, out: Path | None) -> None:
         click.echo(f"mended: {damage}")
     for topic, number in report.backwards.items():
         click.echo(f"kept as they are: {number} messages of {topic} whose log time is before their predecessor's")
+    for flaw in report.flaws:
+        click.echo(f"as in the original: {flaw}")
     if not report.losses:
-        click.echo("nothing was lost")
+        click.echo("nothing more was lost" if report.flaws else "nothing was lost")
         return
     # Of bytes that never came to the file, nothing is known.
     click.echo(f"lost {report.lost_bytes} of {report.size} bytes:" if report.lost_bytes else "lost:")

@@ -9,6 +9,9 @@ ARRIVALS_TOPIC = "microdrivers/arrivals"
 DROPS_TOPIC = "microdrivers/drops"
 TRUTH_PREFIX = "truth/"
 
+PATTERN = frozenset("*?[")
+"""What makes a pattern of a topic's name."""
+
 _WIRE_SUFFIX = "/wire"
 
 
@@ -30,4 +33,4 @@ def is_wanted(topic: str, patterns: Collection[str] | None) -> bool:
 
 def literal(topic: str) -> str:
     """The pattern that matches this topic alone."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in topic)
+    return "".join(f"[{letter}]" if letter in PATTERN else letter for letter in topic)

@@ -27,6 +27,8 @@ from microdrivers.recording.schemas import PACKAGE
 
 LIST_MARK = "; "
 """Between the losses in a repaired file's metadata."""
+LOST_BEFORE_REPAIR = "lost before the repair: "
+"""How a loss begins that a repaired file tells of."""
 
 
 def open_scan(file: Path) -> McapScan:
@@ -47,7 +49,7 @@ def told_losses(scan: McapScan) -> Iterator[Loss]:
     """What the file's metadata tell of losses."""
     for record in scan.metadata:
         if record.name == REPAIR_RECORD and (losses := record.metadata.get("losses")):
-            yield from (Loss(0, 0, f"lost before the repair: {loss}") for loss in losses.split(LIST_MARK))
+            yield from (Loss(0, 0, f"{LOST_BEFORE_REPAIR}{loss}") for loss in losses.split(LIST_MARK))
         elif record.name == FAILURE_RECORD:
             reason = record.metadata.get("reason", "unknown")
             yield Loss(0, 0, f"the recording was stopped because it could not be written: {reason}")
@@ -97,7 +99,7 @@ def _check_version(file: Path, number: int, writer: str) -> None:
     if number > SCHEMA_VERSION:
         raise FutureRecording(
             f"{file} has schema version {number}; this microdrivers reads up to {SCHEMA_VERSION}",
-            remedy=f"install microdrivers {writer or 'as it wrote the file'} or newer",
+            remedy=f"install the microdrivers that wrote it{writer and f' ({writer})'}, or a newer one",
         )
 
 

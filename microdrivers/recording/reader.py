@@ -13,12 +13,20 @@ from typing import Generic, NamedTuple, TypeVar
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from microdrivers.core.errors import ConfigError
 from microdrivers.core.samples import Frame, Sample
-from microdrivers.recording.channels import ARRIVALS_TOPIC, matches
+from microdrivers.recording.channels import ARRIVALS_TOPIC, PATTERN, matches
 from microdrivers.recording.mcap_records import MESSAGE, MESSAGE_BEGIN, RECORD, read_definition
 from microdrivers.recording.mcap_scan import NOT_ENDED, ChunkPlace, Loss
 from microdrivers.recording.opening import open_scan, read_clock_record, read_header, told_losses
-from microdrivers.recording.recorded_channels import Action, ChannelReader, FrameJoin, Unreadable, channel_reader
+from microdrivers.recording.recorded_channels import (
+    Action,
+    ChannelReader,
+    FrameJoin,
+    Stamps,
+    Unreadable,
+    channel_reader,
+)
 from microdrivers.recording.survey import Survey, TopicSummary, unexplained_gaps
 
 __all__ = ["Recording", "TopicSummary"]
@@ -58,29 +66,42 @@ class Recording:
         self.clock = read_clock_record(self._scan)
         self._damaged: dict[int, Loss] = {}
         self._unreadable: dict[tuple[int, int], str] = {}
-        self._survey: Survey | None = None
-        self._frames: dict[int, tuple[str, int, int]] = {}
-        """Topic, `t_ns` and `seq` of frames that were read, by the place of a chunk that holds nothing else."""
+        self._frames: dict[int, tuple[str, Stamps]] = {}
+        """Topic and stamps of frames that were read, by the place of a chunk that holds nothing else."""
 
     def samples(
-        self, topics: Collection[str] | None = None, *, leave_out: Collection[str] = ()
+        self, topics: Collection[str] | None = None, *, leave_out: Collection[str] = (), required: bool = True
     ) -> Iterator[tuple[str, Sample]]:
         """Topic and sample, in recorded order; frames with their images.
 
         `topics` and `leave_out` may hold patterns: `truth/*`.
 
         Each call reads the file anew. What cannot be read is left out, and is told by `losses`.
-        """
-        return chain.from_iterable(self._walk(topics, lambda reader: reader.take, leave_out=leave_out))
 
-    def _read_all(self) -> Survey:
-        """What the file holds; once it has been read, what is damaged of it is known."""
-        if self._survey is None:
-            survey = Survey()
-            for _ in self._walk(None, survey.counter, known_frame=survey.count_frame):
-                pass
-            self._survey = survey
-        return self._survey
+        Raises:
+            ConfigError: `topics` is a text rather than several; or, at the end, one of them that is no pattern is
+                `required` and not in the recording.
+        """
+        if isinstance(topics, str):
+            raise ConfigError(f"topics must be several, not the text {topics!r}", remedy=f"give [{topics!r}]")
+        seen: set[str] = set()
+
+        def take(reader: ChannelReader) -> Action[Sample]:
+            seen.add(reader.topic)
+            return reader.take
+
+        found = chain.from_iterable(self._walk(topics, take, leave_out=leave_out))
+        return chain(found, self._check_seen(topics, seen)) if topics is not None and required else found
+
+    def _check_seen(self, topics: Collection[str], seen: Collection[str]) -> Iterator[tuple[str, Sample]]:
+        """Yields nothing; refuses names that no topic had."""
+        for name in topics:
+            if not PATTERN & set(name) and name not in seen and name not in self.topics:
+                raise ConfigError(
+                    f"{self.file} has no topic {name!r}",
+                    remedy=f"give one of {', '.join(map(repr, self.topics))}, or a pattern such as 'truth/*'",
+                )
+        yield from ()
 
     @cached_property
     def _arrivals(self) -> Mapping[str, Sequence[int]]:
@@ -89,10 +110,13 @@ class Recording:
             pass
         return notes.arrivals
 
-    @property
+    @cached_property
     def topics(self) -> Mapping[str, TopicSummary]:
         """What there is of each topic; the first look at it reads all of the file."""
-        return self._read_all().topics()
+        survey = Survey()
+        for _ in self._walk(None, survey.counter, known_frame=survey.count_frame):
+            pass
+        return survey.topics()
 
     @property
     def arrivals(self) -> Mapping[str, Sequence[int]]:
@@ -118,7 +142,7 @@ class Recording:
 
     @property
     def _damage(self) -> list[Loss]:
-        self._read_all()
+        _ = self.topics  # reads all
         what = Counter(self._unreadable.values())
         unreadable = [Loss(0, 0, f"{count} × {text}") for text, count in what.items()]
         return [*self._scan.unreadable, *sorted([*self._scan.losses, *self._damaged.values()]), *unreadable]
@@ -152,10 +176,13 @@ class Recording:
     def flaws(self) -> list[str]:
         """What whoever uses the recording should be told; the first look at it reads all of the file.
 
-        That is all that cannot be read, is not there or was lost by the recorder, and samples out of order of time.
+        That is all that cannot be read, is not there or was lost by the recorder, and samples that are repeated, or out
+        of order of time.
         """
         told = [*(f"not readable: {loss}" for loss in self._damage), *map(str, self._told), *self.drops, *self.skipped]
         for name, topic in self.topics.items():
+            if topic.repeated:
+                told.append(f"repeated: {topic.repeated} samples of {name!r} stand in the file once more")
             if topic.unsorted:
                 told.append(f"out of order: {topic.unsorted} samples of {name!r} are older than their predecessor")
         return told
@@ -178,7 +205,7 @@ class Recording:
         action: Callable[[ChannelReader], Action[FoundT]],
         *,
         leave_out: Collection[str] = (),
-        known_frame: Callable[[str, int, int], None] | None = None,
+        known_frame: Callable[[str, Stamps], None] | None = None,
     ) -> Iterator[list[tuple[str, FoundT]]]:
         """By chunk: topic, and what the channel's action makes of each message of the wanted topics, if anything.
 
@@ -254,7 +281,7 @@ class Recording:
             if found is not None:
                 made.append((topic, found))
                 if isinstance(found, Frame) and records == 2 and position == len(chunk):  # its info and its image
-                    self._frames[place.offset] = topic, found.t_ns, found.seq
+                    self._frames[place.offset] = topic, Stamps(found.t_ns, found.seq, found.order)
         return made
 
 

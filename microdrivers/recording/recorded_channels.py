@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, Schema
@@ -22,12 +22,23 @@ from microdrivers.recording.schemas import (
     schema_name,
 )
 
-_STAMPS = struct.Struct("<BqBqBq")
-"""How every sample of the present schema begins: t_ns, dt_ns, seq, each behind its tag."""
+_STAMPS = struct.Struct("<BqBqBqBq")
+"""How every sample of the present schema begins: t_ns, dt_ns, seq, order, each behind its tag."""
 _STAMP_TAGS = tuple(
-    field.number << 3 | 1 for name in ("t_ns", "dt_ns", "seq") for field in fields_of(FrameInfo) if field.name == name
+    field.number << 3 | 1
+    for name in ("t_ns", "dt_ns", "seq", "order")
+    for field in fields_of(FrameInfo)
+    if field.name == name
 )
 _NOTES = {schema_name(kind): kind for kind in (Arrivals, Drops)}
+
+
+class Stamps(NamedTuple):
+    """What tells a sample from all others of its recording."""
+
+    t_ns: int
+    seq: int
+    order: int
 
 
 FoundT = TypeVar("FoundT", covariant=True)
@@ -67,8 +78,8 @@ class ChannelReader:
         """
         raise NotImplementedError
 
-    def stamps(self, data: Any, sequence: int) -> tuple[int, int] | None:
-        """`t_ns` and `seq` of the sample that the message completes, for less than it costs to read it."""
+    def stamps(self, data: Any, sequence: int) -> Stamps | None:
+        """Those of the sample that the message completes, for less than it costs to read it."""
         raise NotImplementedError
 
 
@@ -87,14 +98,14 @@ class SampleReader(ChannelReader):
         except _MISFITS as error:
             raise _misfit(error) from error
 
-    def stamps(self, data: Any, sequence: int) -> tuple[int, int] | None:
+    def stamps(self, data: Any, sequence: int) -> Stamps | None:
         """As in `ChannelReader`."""
         if len(data) >= _STAMPS.size:
-            t_tag, t_ns, dt_tag, _, seq_tag, seq = _STAMPS.unpack_from(data)
-            if (t_tag, dt_tag, seq_tag) == _STAMP_TAGS:
-                return t_ns, seq
+            t_tag, t_ns, dt_tag, _, seq_tag, seq, order_tag, order = _STAMPS.unpack_from(data)
+            if (t_tag, dt_tag, seq_tag, order_tag) == _STAMP_TAGS:
+                return Stamps(t_ns, seq, order)
         sample = self.take(data, sequence)
-        return None if sample is None else (sample.t_ns, sample.seq)
+        return None if sample is None else Stamps(sample.t_ns, sample.seq, sample.order)
 
 
 class FrameJoin:
@@ -134,7 +145,7 @@ class InfoReader(ChannelReader):
         self._frame.put(self._decode(data), sequence)
         return None
 
-    def stamps(self, data: Any, sequence: int) -> tuple[int, int] | None:
+    def stamps(self, data: Any, sequence: int) -> Stamps | None:
         """As in `ChannelReader`."""
         self.take(data, sequence)
         return None
@@ -158,10 +169,10 @@ class ImageReader(ChannelReader):
         except ValueError as error:
             raise Unreadable(str(error)) from error
 
-    def stamps(self, _data: Any, sequence: int) -> tuple[int, int] | None:
+    def stamps(self, _data: Any, sequence: int) -> Stamps | None:
         """As in `ChannelReader`."""
         info = self._frame.claim(sequence)
-        return info.t_ns, info.seq
+        return Stamps(info.t_ns, info.seq, info.order)
 
 
 class NoteReader(ChannelReader):
@@ -175,7 +186,7 @@ class NoteReader(ChannelReader):
         """As in `ChannelReader`."""
         return None
 
-    def stamps(self, _data: Any, _sequence: int) -> tuple[int, int] | None:
+    def stamps(self, _data: Any, _sequence: int) -> Stamps | None:
         """As in `ChannelReader`."""
         return None
 

@@ -23,8 +23,9 @@ from microdrivers.recording.images import IMAGE_SCHEMA
 from microdrivers.recording.mcap_records import MESSAGE, RECORD, read_definition, records_in
 from microdrivers.recording.mcap_scan import Loss, McapScan
 from microdrivers.recording.mcap_writer import ChannelKey, McapWriter
-from microdrivers.recording.opening import LIST_MARK, open_scan, read_clock_record, read_header
+from microdrivers.recording.opening import LIST_MARK, LOST_BEFORE_REPAIR, open_scan, read_clock_record, read_header
 from microdrivers.recording.output import not_writable, refuse_existing, whole_file
+from microdrivers.recording.reader import Recording
 from microdrivers.recording.schemas import FrameInfo, schema_name
 
 
@@ -37,6 +38,7 @@ class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
         losses: what could not be.
         mended: what was damaged and could be made anew.
         backwards: how many messages of which topic were logged before their predecessor, as their log times say.
+        flaws: what the original lacked or had wrong otherwise, and the repaired file still does.
         size, lost_bytes: of the original, and how many of these cannot be read.
     """
 
@@ -46,6 +48,7 @@ class RepairReport(msgspec.Struct, frozen=True, kw_only=True):
     losses: list[Loss]
     mended: list[Loss]
     backwards: Mapping[str, int]
+    flaws: list[str]
     size: int
     lost_bytes: int
 
@@ -77,8 +80,13 @@ def repair(file: Path, out: Path) -> RepairReport:
         scan.close()
     return RepairReport(
         file=file, out=out, messages=dict(copy.messages), losses=copy.losses, mended=copy.mended,
-        backwards=dict(+copy.backwards), size=scan.size, lost_bytes=_lost_bytes(copy.losses),
+        backwards=dict(+copy.backwards), flaws=_flaws(out), size=scan.size, lost_bytes=_lost_bytes(copy.losses),
     )  # fmt: skip
+
+
+def _flaws(repaired: Path) -> list[str]:
+    with Recording(repaired) as recording:
+        return [flaw for flaw in recording.flaws if not flaw.startswith(LOST_BEFORE_REPAIR)]
 
 
 def _lost_bytes(losses: Iterable[Loss]) -> int:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from microdrivers.core.bus import HISTORY_LENGTH, Bus, Topic
 from microdrivers.core.clock import Clock
-from microdrivers.core.errors import UnsupportedError
+from microdrivers.core.errors import DataError, UnsupportedError
 from microdrivers.core.samples import Frame, RoutineNote, Sample
 from microdrivers.recording.reader import Recording
 
@@ -37,7 +37,7 @@ def notes_of(recording: Recording) -> list[Note]:
     """All that routines have noted, in their order."""
     found = [
         Note(sample.kind, json.loads(sample.content), sample.order)
-        for _, sample in recording.samples((ROUTINE,))
+        for _, sample in recording.samples((ROUTINE,), required=False)
         if isinstance(sample, RoutineNote)
     ]
     return sorted(found, key=lambda note: note.order)
@@ -56,6 +56,9 @@ class Replay:
 
     Attributes:
         published: number of samples so far. missing: samples that an inbox got and the recording does not hold.
+
+    A sample that the file holds twice is published once. Where it holds one farther from its place than threads can
+    overtake each other, whatever reaches that place raises `DataError`.
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class Replay:
         self._source: Iterator[tuple[str, Sample]] = recording.samples(leave_out=leave_out)
         self._waiting: deque[tuple[str, Sample]] = deque()
         self._frames_waiting = 0
+        self._taken = -1
         self._topics: dict[str, Topic[Any]] = {}
         self._recording = recording
         self._clock = clock
@@ -139,21 +143,44 @@ class Replay:
         """Read ahead; tells whether anything is left."""
         waiting = self._waiting
         if self._frames_waiting < _FRAMES_AHEAD:
-            newest = waiting[-1][1].order if waiting else -1
+            newest = waiting[-1][1].order if waiting else self._taken
             for entry in self._source:
                 order = entry[1].order
-                if order >= newest:
+                if order > newest or order < 0:
                     waiting.append(entry)
                     newest = order
-                else:
-                    _insert(waiting, entry)
+                elif not self._insert(entry):
+                    continue
                 self._frames_waiting += isinstance(entry[1], Frame)
                 if len(waiting) >= 2 * _READ_AHEAD or self._frames_waiting >= _FRAMES_AHEAD:
                     break
         return bool(waiting)
 
+    def _insert(self, entry: tuple[str, Sample]) -> bool:
+        """Put it in its place behind those that are not newer; False if it is there already.
+
+        Raises:
+            DataError: what follows it has been published already.
+        """
+        waiting, order = self._waiting, entry[1].order
+        place = len(waiting)
+        while place and waiting[place - 1][1].order > order:
+            place -= 1
+        before = waiting[place - 1][1].order if place else self._taken
+        if order == before:
+            return False
+        if order < before:
+            raise DataError(
+                f"{self._recording.file} does not hold its samples in the order in which they were published: one of "
+                f"{entry[0]!r} stands far behind its place",
+                remedy="another program has rewritten the file: have it sort the messages by their log time",
+            )
+        waiting.insert(place, entry)
+        return True
+
     def _take_next(self) -> tuple[str, Sample]:
         entry = self._waiting.popleft()
+        self._taken = entry[1].order
         if isinstance(entry[1], Frame):
             self._frames_waiting -= 1
         if len(self._waiting) < _READ_AHEAD:
@@ -177,11 +204,3 @@ class Replay:
             self._began_ns = clock.now_ns(), sample.t_ns
         start_ns, first_ns = self._began_ns
         clock.sleep_until(start_ns + round((sample.t_ns - first_ns) / speed))
-
-
-def _insert(waiting: deque[tuple[str, Sample]], entry: tuple[str, Sample]) -> None:
-    """Put it behind all that are not newer."""
-    place = len(waiting)
-    while place and waiting[place - 1][1].order > entry[1].order:
-        place -= 1
-    waiting.insert(place, entry)

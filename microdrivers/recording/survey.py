@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from microdrivers.core.samples import Frame, Sample
+from microdrivers.core.samples import Frame, Sample, WireTraffic
 from microdrivers.core.units import NS_PER_S
-from microdrivers.recording.recorded_channels import Action, ChannelReader, NoteReader
+from microdrivers.recording.recorded_channels import Action, ChannelReader, NoteReader, Stamps
 from microdrivers.recording.schemas import Arrivals, Drops
 
 
@@ -22,7 +24,9 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
         first_t_ns, last_t_ns: earliest and latest instant, ns on the rig's clock; 0 if there are none.
         rate_hz: mean rate between these; NaN with fewer than two different instants.
         gaps: how many `seq` numbers are missing between the lowest and the highest.
-        unsorted: how many samples describe an instant before their predecessor's.
+        repeated: how many stand in the file once more, by their `order`.
+        unsorted: how many samples describe an instant before their predecessor's. None on wires: what passes there
+            stands in the order in which the computer handled it, and a frame may have arrived long before.
         dropped: how many the recorder itself has lost.
     """
 
@@ -32,6 +36,7 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
     last_t_ns: int
     rate_hz: float
     gaps: int
+    repeated: int
     unsorted: int
     dropped: int
 
@@ -65,19 +70,19 @@ class Survey:
         def count(data: Any, sequence: int) -> None:
             stamps = reader.stamps(data, sequence)
             if stamps is not None and reader.sample_type is not None:
-                self._count(reader.topic, reader.sample_type, *stamps)
+                self._count(reader.topic, reader.sample_type, stamps)
 
         return count
 
-    def count_frame(self, topic: str, t_ns: int, seq: int) -> None:
+    def count_frame(self, topic: str, stamps: Stamps) -> None:
         """Count a frame that was read before."""
-        self._count(topic, Frame, t_ns, seq)
+        self._count(topic, Frame, stamps)
 
-    def _count(self, topic: str, sample_type: type[Sample], t_ns: int, seq: int) -> None:
+    def _count(self, topic: str, sample_type: type[Sample], stamps: Stamps) -> None:
         counted = self._counts.get(topic)
         if counted is None:
             counted = self._counts[topic] = _Count(sample_type)
-        counted.add(t_ns, seq)
+        counted.add(*stamps)
 
     def _take_note(self, note: Arrivals | Drops) -> None:
         if isinstance(note, Arrivals):
@@ -95,15 +100,18 @@ class Survey:
 class _Count:
     """The running figures of one topic."""
 
-    __slots__ = ("count", "first_ns", "first_seq", "last_ns", "last_seq", "previous_ns", "sample_type", "unsorted")
+    __slots__ = (
+        "count", "first_ns", "first_seq", "last_ns", "last_seq", "orders", "previous_ns", "sample_type", "unsorted"
+    )  # fmt: skip
 
     def __init__(self, sample_type: type[Sample]) -> None:
         self.sample_type = sample_type
         self.count = self.unsorted = self.first_seq = 0
         self.last_seq = -1
         self.first_ns = self.last_ns = self.previous_ns = 0
+        self.orders = array("q")
 
-    def add(self, t_ns: int, seq: int) -> None:
+    def add(self, t_ns: int, seq: int, order: int) -> None:
         if self.count:
             self.unsorted += t_ns < self.previous_ns
             self.first_ns = min(self.first_ns, t_ns)
@@ -116,12 +124,15 @@ class _Count:
             self.first_ns = self.last_ns = t_ns
             self.first_seq = self.last_seq = seq
         self.count += 1
+        self.orders.append(order)
         self.previous_ns = t_ns
 
     def summary(self, dropped: int) -> TopicSummary:
         span_ns = self.last_ns - self.first_ns
+        repeated = self.count - len(np.unique(self.orders))
         return TopicSummary(
             sample_type=self.sample_type, count=self.count, first_t_ns=self.first_ns, last_t_ns=self.last_ns,
             rate_hz=(self.count - 1) * NS_PER_S / span_ns if span_ns else float("nan"),
-            gaps=max(0, self.last_seq - self.first_seq + 1 - self.count), unsorted=self.unsorted, dropped=dropped,
+            gaps=max(0, self.last_seq - self.first_seq + 1 - self.count + repeated), repeated=repeated,
+            unsorted=0 if self.sample_type is WireTraffic else self.unsorted, dropped=dropped,
         )  # fmt: skip

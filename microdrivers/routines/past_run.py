@@ -71,7 +71,8 @@ def past_run(
     # First, as `info` does not tell it: what is behind the last flaw that has room is looked up there.
     frames = f", among them {lost_frames} frame{'s' * (lost_frames > 1)} of the experiment" if lost_frames else ""
     lacks = [f"it lacks {missing} sample{'s' * (missing > 1)} that the estimators had{frames}"] if missing else []
-    return PastRun(ended_by, (*lacks, *recording.flaws), missing, lost_frames, lost_last)
+    unordered = [] if recording.arrivals else ["it does not tell in which order its estimators got their samples"]
+    return PastRun(ended_by, (*lacks, *unordered, *recording.flaws), missing, lost_frames, lost_last)
 
 
 def noted_settings(

@@ -173,6 +173,7 @@ def test_other_settings_of_the_estimators_are_tried_on_old_data(run, run_file, f
     usual = again("optics", run_file)
     settings = usual["provenance"]["settings"]
     fewer = again("optics", run_file, "--frames", "15")
+    assert any("in which order its estimators got their samples" in note for note in usual["notes"])  # not recorded
     assert (usual["frames"], fewer["frames"], fewer["complete"]) == (settings["frames"], 15, True)
     assert fewer["provenance"]["settings"]["frames"] == 15
     forgetful = again("optics", run_file, "--forgetting", "0.6", "--flush-frames", "2")
@@ -329,6 +330,16 @@ def test_analyse(run, run_file, tmp_path):
     [row] = read_table(tmp_path / "t.csv")
     assert (row["doubtful"], row["complete"], row["missing"]) == ("0", "1", "0")
     assert "never overwritten" in run("analyse", ".", "--out", "t.csv").stderr
+
+
+def test_a_folder_is_no_file_and_a_cluster_has_its_own_workers(run, run_file):
+    for command in (("recording", "repair", "."), ("recording", "repair", run_file, "--out", "."),
+                    ("analyse", run_file, "--out", ".")):  # fmt: skip
+        result = run(*command)
+        assert result.exit_code == 2
+        assert "is a directory" in result.stderr
+    result = run("analyse", run_file, "--jobs", "2", "--dask", "tcp://127.0.0.1:9")
+    assert "--jobs and --dask exclude each other" in result.stderr
 
 
 def rewrite(source, file, change=lambda sample: [sample]):

@@ -8,6 +8,8 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from microdrivers.core.errors import ConfigError, DataError
+from microdrivers.recording import replay
 from microdrivers.recording.errors import ForeignRecording
 from microdrivers.recording.mcap_scan import McapScan
 from microdrivers.recording.playback import open_replay
@@ -15,8 +17,8 @@ from microdrivers.recording.reader import Recording
 from microdrivers.recording.repair import repair
 
 
-def rewrite(source, file, compression):
-    """As the official library does it."""
+def rewrite(source, file, compression=CompressionType.NONE, arrange=list):
+    """As the official library does it, its messages as `arrange` makes them of (schema, channel, message)."""
     with source.open("rb") as stream, file.open("wb") as output:
         reader = make_reader(stream)
         writer = Writer(output, chunk_size=20_000, compression=compression)
@@ -24,7 +26,7 @@ def rewrite(source, file, compression):
         for record in reader.iter_metadata():
             writer.add_metadata(record.name, record.metadata)
         channels = {}
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
+        for schema, channel, message in arrange(reader.iter_messages(log_time_order=False)):
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
@@ -64,6 +66,70 @@ def test_a_damaged_chunk_that_another_program_has_compressed_is_told_and_the_nex
             assert 0 < len(list(recording.samples())) < len(recorded.published)
             assert recording.losses[0].offset == first.offset
             assert second.offset in [place.offset for place in recording._scan.chunks]
+
+
+def twice(messages):
+    """Forces once more, each behind itself."""
+    for entry in messages:
+        yield entry
+        if entry[1].topic == "force":
+            yield entry
+
+
+def test_samples_that_stand_there_twice_are_counted_and_published_once(recorded, tmp_path):
+    file = tmp_path / "twice.mcap"
+    rewrite(recorded.file, file, arrange=twice)
+    with open_replay(file) as playback:
+        playback.run()
+        assert playback.counts == {"force": 500, "camera": 10}
+        topics = playback.recording.topics
+        assert {name: (topic.repeated, topic.gaps) for name, topic in topics.items()} == {
+            "force": (500, 0), "camera": (0, 0)
+        }  # fmt: skip
+        assert playback.recording.flaws == ["repeated: 500 samples of 'force' stand in the file once more"]
+    report = repair(file, tmp_path / "repaired.mcap")
+    assert (report.losses, report.flaws) == ([], ["repeated: 500 samples of 'force' stand in the file once more"])
+
+
+def test_a_repeated_sample_hides_none_that_is_missing(recorded, tmp_path):
+    file = tmp_path / "other.mcap"
+    rewrite(recorded.file, file, arrange=lambda messages: [*(all_of := list(messages))[:100], *all_of[99:]])
+    with Recording(file) as recording:
+        found = recording.topics["force"]
+    assert (found.count, found.repeated, found.gaps) == (501, 1, 0)
+    rewrite(
+        recorded.file, file, arrange=lambda messages: [*(all_of := list(messages))[:99], *all_of[98:120], *all_of[121:]]
+    )
+    with Recording(file) as recording:
+        found = recording.topics["force"]
+    assert (found.count, found.repeated, found.gaps) == (500, 1, 1)
+
+
+def test_topics_one_after_the_other_are_not_taken_for_the_order_of_the_run(recorded, tmp_path, monkeypatch):
+    """Each channel is in order, as MCAP asks for; what is not read far enough ahead cannot be put in its place."""
+    file = tmp_path / "by_topic.mcap"
+
+    def by_topic(messages):
+        return sorted(messages, key=lambda each: each[1].topic.startswith("camera"))
+
+    rewrite(recorded.file, file, arrange=by_topic)
+    with open_replay(file) as playback:
+        published = []
+        playback.bus.watch(lambda topic: topic.subscribe(lambda sample: published.append(sample.order)))
+        playback.run()
+        assert published == sorted(published)
+    monkeypatch.setattr(replay, "_READ_AHEAD", 100)
+    with open_replay(file) as playback, pytest.raises(DataError, match="order in which they were published"):
+        playback.run()
+
+
+def test_names_that_no_topic_has_are_refused_and_patterns_may_match_none(recorded):
+    with Recording(recorded.file) as recording:
+        for wrong in ("force", ["nowhere"], ["force", "nowhere"]):
+            with pytest.raises(ConfigError):
+                list(recording.samples(wrong))
+        assert list(recording.samples(["nowhere*"])) == []
+        assert list(recording.samples(["nowhere"], required=False)) == []
 
 
 @pytest.mark.parametrize("profile", ["microdrivers", "ros2"])

@@ -148,7 +148,7 @@ def test_a_calibration_of_which_all_is_there_is_analysed_as_it_was_set_and_not_d
     live, row = build_optics_result(run, provenance), analyse_recording(str(file))
     figures = ("scale_px_per_um", "scale_sigma_px_per_um", "angle_deg", "angle_sigma_deg", "zoom", "frames")
     assert [row[name] for name in figures] == [getattr(live, name) for name in figures]
-    counts = ("losses", "missing", "dropped", "unsorted", "lost_frames")
+    counts = ("losses", "missing", "dropped", "repeated", "unsorted", "lost_frames")
     assert [row[name] for name in ("doubtful", "complete", *counts)] == [False, True, *[0] * len(counts)]
 
 

@@ -22,7 +22,7 @@ Row = dict[str, str | int | float | bool | None]
 
 COLUMNS: Mapping[str, type] = {
     "file": str, "kind": str, "error": str, "doubtful": bool,
-    "complete": bool, "losses": int, "missing": int, "dropped": int, "unsorted": int,
+    "complete": bool, "losses": int, "missing": int, "dropped": int, "repeated": int, "unsorted": int,
     "created_utc": str, "rig": str, "seed": int,
     "frames": int, "lost_frames": int, "unmatched_frames": int,
     "scale_px_per_um": float, "scale_sigma_px_per_um": float, "zoom": float, "magnification": float,
@@ -37,14 +37,14 @@ COLUMNS: Mapping[str, type] = {
 """Columns of the table and what they hold.
 
 `doubtful` marks a row with an `error` or with `doubts`: the run is not `complete`, or something of its recording is
-damaged or lost (`losses`, `dropped`, `missing`) or out of order (`unsorted`). `missing` counts samples that the file
-lacks: those that the estimators had, or whose numbers are skipped. `notes` are those of the result. `true_…` is against
-the truth of a simulation.
+damaged or lost (`losses`, `dropped`, `missing`), stands there twice (`repeated`) or is out of order (`unsorted`).
+`missing` counts samples that the file lacks: those that the estimators had, or whose numbers are skipped. `notes` are
+those of the result. `true_…` is against the truth of a simulation.
 """
 
 _FLAWS = {
     "losses": "damaged or lost parts", "missing": "missing samples", "dropped": "dropped samples",
-    "unsorted": "samples out of order",
+    "repeated": "samples that stand there twice", "unsorted": "samples out of order",
 }  # fmt: skip
 
 
@@ -60,7 +60,7 @@ def analyse_recording(file: str) -> Row:
             topics = recording.topics.values()
             skipped = sum(topic.gaps for topic in topics)
             row |= {"losses": len(recording.losses), "missing": skipped}
-            row |= {name: sum(getattr(topic, name) for topic in topics) for name in ("dropped", "unsorted")}
+            row |= {name: sum(getattr(topic, name) for topic in topics) for name in ("dropped", "repeated", "unsorted")}
             found, past_run = _analyse(recording)
             row |= found | {"missing": max(skipped, past_run.missing)}
     except MicrodriversError as error:

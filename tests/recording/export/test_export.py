@@ -134,7 +134,7 @@ def test_what_a_damaged_recording_lacks_is_told_beside_what_is_exported(optics_r
     data = bytearray(optics_recording.read_bytes())
     with Recording(optics_recording) as recording:
         assert len(list(recording.samples(["camera"]))) == 30
-        place = next(offset for offset, (_, _, seq) in recording._frames.items() if seq == 12)
+        place = next(offset for offset, (_, stamps) in recording._frames.items() if stamps.seq == 12)
         length = next(chunk.length for chunk in recording._scan.chunks if chunk.offset == place)
     data[place + length - 1] ^= 1
     file.write_bytes(data)
