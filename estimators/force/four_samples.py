@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from microdrivers.core.errors import DataError
+from microdrivers.core.errors import DataError, OutOfRange
 from microdrivers.estimators.force.triangles import Six, norm, norm_with_mass, sandwich, without_mass
 
 Array = npt.NDArray[np.float64]
@@ -79,13 +79,15 @@ class FourSampleRecursion:
         with_mass: estimate m too; without it, the acceleration is not looked at.
 
     Raises:
-        ValueError: a scale or the ridge is not positive and finite.
+        OutOfRange: a scale or the ridge is not positive and finite.
     """
 
     def __init__(self, *, scales: Scales | None = None, ridge: float = 1e-11, with_mass: bool = False) -> None:
         self.scales = scales or Scales()
         if not all(math.isfinite(value) and value > 0.0 for value in (ridge, *self.scales)):
-            raise ValueError(f"ridge {ridge} and scales {self.scales} must be positive and finite")
+            raise OutOfRange(
+                f"the ridge is {ridge}, the scales are {self.scales}", remedy="give positive, finite numbers"
+            )
         self.ridge = ridge
         self.with_mass = with_mass
         self.samples_used = 0
@@ -118,11 +120,11 @@ class FourSampleRecursion:
             a_um_s2: the rate of `v_um_s`.
 
         Raises:
-            ValueError: `forgetting` is outside [0, 1].
+            OutOfRange: `forgetting` is outside [0, 1].
             DataError: a number is not finite, or too large to be squared. The estimate is then unchanged.
         """
         if not 0.0 <= forgetting <= 1.0:
-            raise ValueError(f"forgetting is {forgetting}: it must lie in [0, 1]")
+            raise OutOfRange(f"forgetting is {forgetting}", remedy="give a number from 0 to 1")
         x_scale, v_scale, a_scale = self.scales
         x = x_um / x_scale
         c = x * x * x

@@ -6,11 +6,13 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
 
-from microdrivers.core.errors import IllConditioned
+from microdrivers.core.errors import IllConditioned, OutOfRange
+from microdrivers.core.protocol_names import MOST_AROUND_REVERSAL
 from microdrivers.estimators.force.branches import Branches
 from microdrivers.estimators.force.fitting import damping_on_the_way_back
 from microdrivers.estimators.force.judgement import judge
@@ -43,12 +45,25 @@ class IdentificationSettings(NamedTuple):
     """How to identify.
 
     Attributes:
-        around_reversal: samples left out on either side of contact, reversals and release.
+        around_reversal: samples left out on either side of contact, reversals and release; 0 to 20.
         protocol: which one's model counts; None: the one that explains the record best, see `Identification.best`.
     """
 
     around_reversal: int = 2
     protocol: ProtocolName | None = None
+
+    def check(self) -> None:
+        """Refuse a number of samples that nobody can leave out.
+
+        Raises:
+            OutOfRange: `around_reversal` is not a whole number from 0 to `MOST_AROUND_REVERSAL`.
+        """
+        given: object = self.around_reversal  # callers from notebooks have no type checker
+        if not isinstance(given, Integral) or not 0 <= self.around_reversal <= MOST_AROUND_REVERSAL:
+            raise OutOfRange(
+                f"{given} samples cannot be left out around a reversal",
+                remedy=f"give a whole number from 0 to {MOST_AROUND_REVERSAL}",
+            )
 
 
 class Contact(NamedTuple):
@@ -130,10 +145,12 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
         DataError: the record cannot be used; see `record.check`. Of these, NoContact: it shows no contact;
             SaturatedData: the sensor was at the end of its range in most of it, or of the loading; TargetLost: the
             contact point was lost in most of it.
+        OutOfRange: `settings` are; see `IdentificationSettings.check`.
         IllConditioned: the record does not allow the protocol that is asked for.
     """
     settings = settings or IdentificationSettings()
-    check(record)
+    settings.check()
+    record = check(record)
     prepared, on_ramps = settled(record, settings.around_reversal)
     fits = all_protocols(prepared, on_ramps)
     both_ways = "single" in fits

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from numbers import Integral
 from typing import NamedTuple
 
+from microdrivers.core.errors import OutOfRange
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.force.line_fit import LineFit, Point, broken_line_gains, fit, shape_gain
 from microdrivers.estimators.force.scatter import RunningScatter
@@ -47,7 +49,7 @@ class MotionSettings(NamedTuple):
             a shorter lag it is that of `(window + 1)/2 − lag` positions before.
         with_acceleration: fit parabolas.
         with_lateness: find `late_um_s`, which is 0 otherwise.
-        max_gap_s: positions further apart than this belong to different motions.
+        max_gap_s: positions further apart than this belong to different motions; > 0.
     """
 
     lag: int = 9
@@ -55,6 +57,23 @@ class MotionSettings(NamedTuple):
     with_acceleration: bool = False
     with_lateness: bool = False
     max_gap_s: float = 0.25
+
+    def check(self) -> None:
+        """Refuse a lag and a window that tell no velocity, and a gap that is none.
+
+        Raises:
+            OutOfRange: the lag is shorter than `SHORTEST_LAG`, the window not longer than the lag, or the gap not > 0.
+        """
+        given: tuple[object, ...] = (self.lag, self.window)  # callers from notebooks have no type checker
+        if not all(isinstance(number, Integral) for number in given) or not SHORTEST_LAG <= self.lag < self.window:
+            raise OutOfRange(
+                f"a lag of {self.lag} in a window of {self.window} tells no velocity",
+                remedy=f"give whole numbers with {SHORTEST_LAG} ≤ lag < window",
+            )
+        if not self.max_gap_s > 0.0:
+            raise OutOfRange(
+                f"max_gap_s is {self.max_gap_s}", remedy="give a time above 0 s, longer than from one frame to the next"
+            )
 
 
 class InstantMotion(NamedTuple):
@@ -106,15 +125,12 @@ class LocalMotion:
     A position that lies far off both neighbours, on the same side, is a spike: no fit uses it.
 
     Raises:
-        ValueError: the lag is shorter than `SHORTEST_LAG` or the window not longer than the lag.
+        OutOfRange: the settings make no sense; see `MotionSettings.check`.
     """
 
     def __init__(self, settings: MotionSettings | None = None) -> None:
         self.settings = settings or MotionSettings()
-        if not SHORTEST_LAG <= self.settings.lag < self.settings.window:
-            raise ValueError(
-                f"a lag of {self.settings.lag} in a window of {self.settings.window}: give 4 ≤ lag < window"
-            )
+        self.settings.check()
         self._beyond = min(self.settings.lag - 1, _MOST_BEYOND)
         self._scatter = RunningScatter()
         self._zero_ns: int | None = None

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample, IndentationSample
+from microdrivers.core.errors import OutOfRange
 from microdrivers.core.samples import ForceSample, Sample
 from microdrivers.core.units import NS_PER_MS, NS_PER_S
 from microdrivers.estimators.force.scatter import ScatterOfMeans
@@ -31,6 +32,23 @@ class MatcherSettings(NamedTuple):
     max_gap_s: float = 0.1
     max_waiting: int = 64
     max_readings: int = 8192
+
+    def check(self) -> None:
+        """Refuse times and numbers with which no frame could be matched.
+
+        Raises:
+            OutOfRange: a time is negative or not finite, `max_gap_s` is 0, or not even one frame and two readings may
+                wait.
+        """
+        if not 0.0 <= self.lateness_s < math.inf:
+            raise OutOfRange(f"lateness_s is {self.lateness_s}", remedy="give a time of 0 s or more")
+        if not 0.0 < self.max_gap_s < math.inf:
+            raise OutOfRange(f"max_gap_s is {self.max_gap_s}", remedy="give a time above 0 s")
+        if not (self.max_waiting >= 1 and self.max_readings >= 2):
+            raise OutOfRange(
+                f"{self.max_waiting} frames and {self.max_readings} readings may wait",
+                remedy="let at least one frame and the two readings around it wait",
+            )
 
 
 class GivenUp(NamedTuple):
@@ -59,10 +77,14 @@ class IndentationMatcher:
     Args:
         settings: when a frame is matched.
         device: name under which the samples are published.
+
+    Raises:
+        OutOfRange: a setting makes no sense; see `MatcherSettings.check`.
     """
 
     def __init__(self, settings: MatcherSettings | None = None, *, device: str = "indentation") -> None:
         self.settings = settings or MatcherSettings()
+        self.settings.check()
         self.device = device
         self.unmatched: Counter[str] = Counter()
         self.given_up: deque[GivenUp] = deque(maxlen=_REMEMBERED)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from microdrivers.core.errors import OutOfRange
 
 Array = npt.NDArray[np.float64]
 
@@ -43,6 +46,39 @@ class SpecimenModel(NamedTuple):
     deepest_um: float = math.inf
     fastest_um_s: float = math.inf
     fastest_unloading_um_s: float = math.inf
+
+
+_REACHES = ("deepest_um", "fastest_um_s", "fastest_unloading_um_s")
+_PARAMETERS = 3
+"""That the covariance is of."""
+
+
+def check_model(model: SpecimenModel) -> None:
+    """Refuse a model that tells no force. A damper may be negative: a specimen may be fitted best by one.
+
+    Raises:
+        OutOfRange: a number is not finite (how deep and how fast may be infinite, but not 0 or less); the residual is
+            negative; a slip has no positive rate; the covariance is neither empty nor 3 × 3.
+    """
+    for name, value in model._asdict().items():
+        if name == "covariance":
+            continue
+        number = float(value) if isinstance(value, Real) else math.nan
+        fine = number > 0.0 if name in _REACHES else math.isfinite(number)
+        if not fine or (name == "residual_uN" and number < 0.0):
+            raise _no_model(f"{name} is {value}")
+    if model.slip_um != 0.0 and not model.slip_rate_per_s > 0.0:
+        raise _no_model(f"slip of {model.slip_um:g} µm has the rate {model.slip_rate_per_s:g} /s, which is not above 0")
+    if len(model.covariance) not in (0, _PARAMETERS**2):
+        raise _no_model(f"covariance has {len(model.covariance)} entries, not 9 (3 × 3, row-major) or none")
+    if not all(map(math.isfinite, model.covariance)):
+        raise _no_model("covariance has an entry that is not finite")
+
+
+def _no_model(what: str) -> OutOfRange:
+    return OutOfRange(
+        f"the model's {what}", remedy="identify the specimen, or read its specimen.yaml, and use that model unchanged"
+    )
 
 
 def force_uN(

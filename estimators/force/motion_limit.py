@@ -6,7 +6,7 @@ import math
 from typing import Literal, NamedTuple
 
 from microdrivers.core.errors import OutOfRange
-from microdrivers.estimators.force.model import SpecimenModel
+from microdrivers.estimators.force.model import SpecimenModel, check_model
 
 LimitedBy = Literal["force", "static_force", "characterised_speed", "nothing"]
 
@@ -37,8 +37,10 @@ def speed_limit(model: SpecimenModel, *, max_force_uN: float, depth_um: float) -
             included; ≤ 0 is a touch.
 
     Raises:
-        OutOfRange: an argument is not finite or out of its range, or the model was not identified so deep.
+        OutOfRange: an argument is not finite or out of its range, the model is none (see `check_model`), or it was not
+            identified so deep.
     """
+    check_model(model)
     if not (math.isfinite(max_force_uN) and max_force_uN > 0.0):
         raise OutOfRange(f"a force of {max_force_uN} µN is not a bound", remedy="give a positive force in µN")
     if not math.isfinite(depth_um):

@@ -77,5 +77,7 @@ class ForceOnset:
 
     def _zero_um(self, at_ns: int, sigma_um: float) -> float:
         line = fit([Point((t_ns - at_ns) / NS_PER_S, x_um) for t_ns, x_um, _ in self._before])
+        if math.isnan(sigma_um):
+            sigma_um = math.sqrt(max(line.left_um2, 0.0) / (line.norm0 - 2.0))
         moved = abs(line.slope) > _MOVES_SIGMAS * sigma_um / math.sqrt(line.norm1)
         return line.position_um(0.0) if moved else line.level_um

@@ -127,7 +127,8 @@ class ProtocolFit:
         return dataclasses.replace(self, weak=weak, identifiable={name: name not in weak for name in self.identifiable})
 
     def model(self) -> SpecimenModel:
-        """What reading force from the camera needs."""
+        """What reading force from the camera needs; without a covariance where the record does not tell it."""
+        known = bool(np.isfinite(self.covariance).all())
         return SpecimenModel(
             k1_uN_per_um=self.k1_uN_per_um,
             k2_uN_per_um3=self.k2_uN_per_um3,
@@ -137,7 +138,7 @@ class ProtocolFit:
             contact_um=self.contact_um,
             slip_um=self.slip_um,
             slip_rate_per_s=self.slip_rate_per_s,
-            covariance=tuple(self.covariance.ravel().tolist()),
+            covariance=tuple(self.covariance.ravel().tolist()) if known else (),
             residual_uN=self.residual_uN,
             deepest_um=self.deepest_um,
             fastest_um_s=self.fastest_um_s,

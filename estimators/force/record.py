@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +11,7 @@ import numpy.typing as npt
 
 from microdrivers.core.errors import DataError, NoContact, SaturatedData, TargetLost
 from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.real_arrays import real_array
 
 Mask = npt.NDArray[np.bool_]
 
@@ -114,18 +117,22 @@ def medians_of_five(values: Array) -> Array:
     return smooth
 
 
-def check(record: IndentationRecord) -> None:
+def check(record: IndentationRecord) -> IndentationRecord:
     """Refuse what cannot be an indentation.
 
     A stretch that is marked `lost` or `saturated` is no error: it is left out later.
 
+    Returns:
+        The record with its columns as arrays of floats: lists will do, and what a masked array masks is NaN.
+
     Raises:
-        DataError: wrong shapes, too short, time not increasing, a gap, NaN, constant force, implausible units, wrong
-            sign.
+        DataError: values that are not real numbers, noise that is negative or infinite, wrong shapes, too short, time
+            not increasing, a gap, NaN, constant force, implausible units, wrong sign.
         NoContact: the force never leaves its noise.
         SaturatedData: most of the record is at the end of the sensor's range.
         TargetLost: the contact point was lost in most of the record.
     """
+    record = _in_floats(record)
     _check_shapes(record)
     _check_time(record.time_s)
     unseen = lost(record)
@@ -145,12 +152,27 @@ def check(record: IndentationRecord) -> None:
     _check_force(record, unseen)
     _check_units(record, unseen)
     _check_one(record, unseen)
+    return record
+
+
+def _in_floats(record: IndentationRecord) -> IndentationRecord:
+    for name in ("deformation_sigma_um", "force_sigma_uN"):
+        sigma = getattr(record, name)
+        if not isinstance(sigma, Real) or sigma < 0.0 or math.isinf(sigma):
+            raise DataError(
+                f"{name} is {sigma!r}", remedy="give a standard deviation above 0, or NaN where it is not known"
+            )
+    return record._replace(
+        time_s=real_array(record.time_s, what="time_s"),
+        deformation_um=real_array(record.deformation_um, what="deformation_um"),
+        force_uN=real_array(record.force_uN, what="force_uN"),
+    )
 
 
 def _check_shapes(record: IndentationRecord) -> None:
     columns = (record.time_s, record.deformation_um, record.force_uN, record.lost, record.saturated)
     shapes = [np.shape(column) for column in columns if column is not None]
-    n = len(record.time_s)
+    n = record.time_s.size
     if any(shape != (n,) for shape in shapes):
         raise DataError(
             f"the columns of the record differ in length: {', '.join(map(str, shapes))}",

@@ -7,6 +7,7 @@ from collections import deque
 from typing import Literal, NamedTuple
 
 from microdrivers.core.contact_samples import IndentationSample, SpecimenEstimate
+from microdrivers.core.errors import OutOfRange
 from microdrivers.core.samples import Sample
 from microdrivers.estimators.force.four_samples import FourSampleRecursion, Scales
 from microdrivers.estimators.force.local_motion import InstantMotion, LocalMotion, MotionSettings
@@ -21,14 +22,15 @@ _FLAGS: dict[Branch | None, frozenset[str]] = {
 }
 _MOVES_SIGMAS = 4.0
 _FORCE_SIGMAS = 5.0
+LEAST_CLEARANCE = 2
 
 
 class RecursionSettings(NamedTuple):
     """How the recursion forgets, and what it leaves out.
 
     Attributes:
-        forgetting: λ from sample to sample.
-        branch_forgetting: λ at the first sample after the motion has changed its sign.
+        forgetting: λ from sample to sample, in (0, 1].
+        branch_forgetting: λ at the first sample after the motion has changed its sign, in [0, 1].
         separate_branches: keep one estimate for loading and one for unloading instead; each keeps its memory.
         with_mass: estimate m too, from fitted parabolas.
         ridge: δ of eq. (24), on columns divided by `scales`.
@@ -37,8 +39,9 @@ class RecursionSettings(NamedTuple):
             velocities lean to the other and share its noise; ≥ 2, or reversals are smeared.
         lag, window: samples that must follow one, and those in the fit of its velocity; see `MotionSettings`.
         max_gap_s: samples further apart than this give no velocity across the gap.
-        least_share: a force below this share of the largest is not used: the tool may have left the specimen.
-        baseline_sigma_uN: the force before contact is taken to scatter by this at least; see `ForceOnset`.
+        least_share: a force below this share of the largest, in [0, 1), is not used: the tool may have left the
+            specimen.
+        baseline_sigma_uN: the force before contact is taken to scatter by this at least, > 0; see `ForceOnset`.
     """
 
     forgetting: float = 0.999
@@ -53,6 +56,22 @@ class RecursionSettings(NamedTuple):
     max_gap_s: float = 0.25
     least_share: float = 0.01
     baseline_sigma_uN: float = 0.01
+
+    def check(self) -> None:
+        """Refuse settings that forget everything at once, smear reversals or see no contact.
+
+        Raises:
+            OutOfRange: one is outside its range. What `FourSampleRecursion` and `LocalMotion` take is theirs to check.
+        """
+        for name, fine, expected in (
+            ("forgetting", 0.0 < self.forgetting <= 1.0, "above 0 and at most 1; 1 forgets nothing"),
+            ("branch_forgetting", 0.0 <= self.branch_forgetting <= 1.0, "from 0 to 1; 0 begins anew at a reversal"),
+            ("clearance", self.clearance >= LEAST_CLEARANCE, f"of {LEAST_CLEARANCE} samples or more"),
+            ("least_share", 0.0 <= self.least_share < 1.0, "from 0 to below 1"),
+            ("baseline_sigma_uN", 0.0 < self.baseline_sigma_uN < math.inf, "above 0 µN"),
+        ):
+            if not fine:
+                raise OutOfRange(f"{name} is {getattr(self, name)}", remedy=f"give a number {expected}")
 
 
 class SpecimenRecursion:
@@ -76,6 +95,9 @@ class SpecimenRecursion:
         contact_um: deformation at which the tool touches; the force must then be tared. None detects it, together
             with the baseline of the force, from the force itself: the record must begin before the contact.
         device: name under which the estimates are published.
+
+    Raises:
+        OutOfRange: a setting or `contact_um` is not finite or out of its range.
     """
 
     def __init__(
@@ -86,6 +108,9 @@ class SpecimenRecursion:
         device: str = "specimen",
     ) -> None:
         self.settings = chosen = settings or RecursionSettings()
+        chosen.check()
+        if contact_um is not None and not math.isfinite(contact_um):
+            raise OutOfRange(f"contact_um is {contact_um}", remedy="give the deformation in µm, or None to detect it")
         self.device = device
         self.late_samples = 0
         self.excluded_samples = 0

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from microdrivers.core.errors import DataError, IllConditioned
+from microdrivers.core.errors import DataError, IllConditioned, OutOfRange
 from microdrivers.estimators.force.model import Array
+from microdrivers.estimators.force.real_arrays import real_array
 
 DEFAULT_RIDGE = 1e-9
 """δ, relative to the number of samples: columns have a mean square of 1."""
@@ -18,7 +19,8 @@ class RidgeFit(NamedTuple):
 
     Attributes:
         theta: one value a column, in the columns' own units.
-        covariance: of theta, from the residual's variance; white noise in the force only is assumed.
+        covariance: of theta, from the residual's variance; white noise in the force only is assumed. NaN where no
+            degree of freedom is left to tell that variance by.
         condition_number: of the scaled columns; 1 is best.
         residual_uN: force minus what theta says, one a sample.
         degrees_of_freedom: samples minus columns.
@@ -43,14 +45,17 @@ def ridge_fit(columns: Array, force_uN: Array, *, ridge: float = DEFAULT_RIDGE) 
         ridge: δ for scaled columns, relative to the number of samples; ≥ 0.
 
     Raises:
-        DataError: shapes do not match, fewer samples than columns, or a value is not finite.
+        DataError: shapes do not match, no columns, fewer samples than columns, or a value is not real and finite.
+        OutOfRange: `ridge` is negative or not finite.
         IllConditioned: `ridge` is 0 and the columns do not determine the parameters.
     """
-    columns, force_uN = np.asarray(columns, dtype=np.float64), np.asarray(force_uN, dtype=np.float64)
-    if columns.ndim != 2 or force_uN.shape != columns.shape[:1] or len(columns) < columns.shape[-1]:
+    if not 0.0 <= ridge < np.inf:
+        raise OutOfRange(f"the ridge is {ridge}", remedy="give a finite number of 0 or more")
+    columns, force_uN = real_array(columns, what="the table of regressors"), real_array(force_uN, what="force_uN")
+    if columns.ndim != 2 or force_uN.shape != columns.shape[:1] or not 0 < columns.shape[1] <= len(columns):
         raise DataError(
             f"{columns.shape} regressors and {force_uN.shape} forces do not determine the parameters",
-            remedy="give one row of regressors a force, and at least as many rows as columns",
+            remedy="give one row of regressors a force, and at least one column and as many rows as columns",
         )
     if not (np.isfinite(columns).all() and np.isfinite(force_uN).all()):
         raise DataError("a regressor or a force is not finite", remedy="leave out samples that were not measured")
@@ -65,7 +70,7 @@ def ridge_fit(columns: Array, force_uN: Array, *, ridge: float = DEFAULT_RIDGE) 
     gain = singular / (singular**2 + delta)
     theta = right.T @ (gain * (left.T @ force_uN)) / scale
     residual = force_uN - columns @ theta
-    free = max(n - p, 1)
-    spread = (right.T * gain**2) @ right * (float(residual @ residual) / free)
+    variance = float(residual @ residual) / (n - p) if n > p else np.nan
+    spread = (right.T * gain**2) @ right * variance
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else float("inf")
     return RidgeFit(theta, spread / np.outer(scale, scale), condition, residual, n - p)

@@ -7,11 +7,13 @@ from collections import deque
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample, VisionForceSample
+from microdrivers.core.errors import DataError
 from microdrivers.core.samples import Sample
 from microdrivers.core.units import NS_PER_S
 from microdrivers.estimators.force.local_motion import InstantMotion, LocalMotion, MotionSettings
 from microdrivers.estimators.force.model import (
     SpecimenModel,
+    check_model,
     force_uN,
     slip_speed_um_s,
     slipped_um,
@@ -37,8 +39,9 @@ class VisionForceSettings(NamedTuple):
         window: frames in the straight fit that gives the velocity, fewer after a corner of the motion. Where the speed
             changes smoothly, the velocity is that of `(window + 1)/2 − lag` frames before, and `sigma_uN` contains what
             that hides.
-        max_gap_s: frames further apart than this give no velocity across the gap, and no force if the model has a
-            damper: a camera at fewer than `1/max_gap_s` frames a second tells none, only `NO_VELOCITY`.
+        max_gap_s: > 0; frames further apart than this give no velocity across the gap, and no force if the model has
+            a damper, be it on one way only: a camera at fewer than `1/max_gap_s` frames a second tells none, only
+            `NO_VELOCITY`.
     """
 
     lag: int = 5
@@ -58,7 +61,8 @@ class VisionForce:
     A change of speed shows after some frames; those told until then state it only if there was one like it before.
     A frame that is lost is published at once, and before it all that wait, by what was known until then.
 
-    Flags: `LOST`, no deformation was seen; `NO_VELOCITY`, there is no velocity and so no force, both NaN;
+    Flags: `LOST`, no deformation was seen; `NO_VELOCITY`, there is no velocity and so no force, both NaN
+    (without any damper, the springs' force is told all the same, and only the velocity is NaN);
     `OUTSIDE_RANGE`, deeper or faster than the model was characterised; `MAY_BE_RELEASED`, the specimen rests on its
     way back with a force left by the model, beyond noise: the tool holds it there, or has left a specimen that lies
     farther in than the model has it, which a camera cannot tell apart.
@@ -67,11 +71,15 @@ class VisionForce:
         model: the identified specimen.
         settings: how the velocity is told.
         device: name under which the samples are published.
+
+    Raises:
+        OutOfRange: a number of the model or a setting is not finite or out of its range.
     """
 
     def __init__(
         self, model: SpecimenModel, settings: VisionForceSettings | None = None, *, device: str = "vision_force"
     ) -> None:
+        check_model(model)
         self.model = model
         self.settings = settings or VisionForceSettings()
         self.device = device
@@ -108,9 +116,17 @@ class VisionForce:
 
         Returns:
             The forces that are now certain, oldest first.
+
+        Raises:
+            DataError: a standard deviation is negative.
         """
         if not isinstance(sample, DeformationSample):
             return []
+        if sample.sigma_um < 0.0:
+            raise DataError(
+                f"a deformation has the standard deviation {sample.sigma_um:g} µm",
+                remedy="state one that is not negative, or NaN where it is not known",
+            )
         if self._newest_ns is not None and sample.t_ns <= self._newest_ns:
             self.late_frames += 1
             return []
@@ -132,6 +148,7 @@ class VisionForce:
         frame = self._waiting.popleft()
         x_um, v_um_s = self._compression(motion)
         seen_uN = self._seen_sigma_uN(motion, x_um, v_um_s)
+        velocity_um_s = motion.velocity_um_s if math.isfinite(motion.velocity_sigma_um_s) else math.nan
         damper = self._damper(v_um_s) if motion.corner_um_s == 0.0 else self._stronger_damper
         hidden_uN = damper * self._lag.hidden_um_s(motion)
         if not math.isfinite(seen_uN):
@@ -150,12 +167,12 @@ class VisionForce:
         if not self._touches:
             if motion.position_um - self.model.contact_um < _AT_REST_UM:
                 self._touched_ns = None
-            return self._publish(frame, 0.0, noise_uN, motion.velocity_um_s, set())
+            return self._publish(frame, 0.0, noise_uN, velocity_um_s, set())
         flags = {OUTSIDE_RANGE} if self._is_outside(motion, x_um, v_um_s) else set()
         if self._rests_on_its_way_back(motion) and raw_uN > _TOUCH_SIGMAS * seen_uN:
             flags.add(MAY_BE_RELEASED)
         sigma_uN = math.hypot(noise_uN, self._model_sigma_uN(x_um, v_um_s))
-        return self._publish(frame, max(raw_uN, 0.0), sigma_uN, motion.velocity_um_s, flags)
+        return self._publish(frame, max(raw_uN, 0.0), sigma_uN, velocity_um_s, flags)
 
     def _rests_on_its_way_back(self, motion: InstantMotion) -> bool:
         v_um_s = motion.velocity_um_s
@@ -177,13 +194,19 @@ class VisionForce:
 
     def _seen_sigma_uN(self, motion: InstantMotion, x_um: float, v_um_s: float) -> float:
         """Standard deviation from the noise of the deformation and of the velocity."""
-        damper = self._damper(v_um_s)
+        # Without a velocity neither is its sign known: any damper may be the one that acts.
+        known = math.isfinite(motion.velocity_sigma_um_s)
+        damper = self._damper(v_um_s) if known else self._either_damper
         from_velocity = damper * motion.velocity_sigma_um_s if damper else 0.0
         from_position = float(stiffness_uN_per_um(self.model, x_um)) * motion.sigma_um
         return math.hypot(from_position, from_velocity)
 
     def _damper(self, v_um_s: float) -> float:
         return self.model.b_loading_uN_s_per_um if v_um_s > 0.0 else self.model.b_unloading_uN_s_per_um
+
+    @property
+    def _either_damper(self) -> float:
+        return self.model.b_loading_uN_s_per_um or self.model.b_unloading_uN_s_per_um
 
     @property
     def _stronger_damper(self) -> float:
@@ -236,6 +259,8 @@ class _Lag:
 
     def hidden_um_s(self, motion: InstantMotion) -> float:
         """Standard deviation of that, for the next motion told."""
+        if math.isnan(motion.velocity_sigma_um_s):
+            return 0.0
         if self._told and self._told[-1].begin_ns != motion.begin_ns:
             self._told.clear()
         if len(self._told) == self._told.maxlen:

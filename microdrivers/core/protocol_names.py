@@ -1,4 +1,4 @@
-"""Names of the ways to fit an indentation; a module of their own, so that a command's help imports nothing heavy."""
+"""The ways to fit an indentation and what they leave out; by itself, so that a command's help imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -8,3 +8,6 @@ ProtocolName = Literal["single", "unloading_springs", "loading_only", "slip_corr
 """The paper's four ways to fit its model, Bilen et al., section III.C, and the loading part alone."""
 
 PROTOCOLS: tuple[ProtocolName, ...] = get_args(ProtocolName)
+
+MOST_AROUND_REVERSAL = 20
+"""Samples that may be left out on either side of contact, reversals and release."""

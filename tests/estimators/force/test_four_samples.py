@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from microdrivers.core.errors import DataError
+from microdrivers.core.errors import DataError, OutOfRange
 from microdrivers.estimators.force.four_samples import STACK, FourSampleRecursion, Scales
 
 Array = npt.NDArray[np.float64]
@@ -169,11 +169,11 @@ def test_what_cannot_be_used_is_refused_and_changes_nothing() -> None:
     for wrong in ({"x_um": math.nan}, {"force_uN": math.inf}, {"v_um_s": 1e200}):
         with pytest.raises(DataError, match="not finite"):
             estimator.update(**({"x_um": 1.0, "v_um_s": 1.0, "force_uN": 1.0, "forgetting": 1.0} | wrong))
-    with pytest.raises(ValueError, match="forgetting"):
+    with pytest.raises(OutOfRange, match="forgetting"):
         estimator.update(x_um=1.0, v_um_s=1.0, force_uN=1.0, forgetting=1.1)
     assert estimator.theta == before
     for bad in ({"ridge": 0.0}, {"ridge": math.nan}, {"scales": Scales(x_um=0.0)}):
-        with pytest.raises(ValueError, match="positive"):
+        with pytest.raises(OutOfRange, match="positive"):
             FourSampleRecursion(**bad)
 
 

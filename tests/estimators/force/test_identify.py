@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from microdrivers.core.errors import DataError, NoContact
+from microdrivers.core.errors import DataError, NoContact, OutOfRange
 from microdrivers.estimators.force.identify import IdentificationSettings, _rivals_marked, identify
 from microdrivers.estimators.force.model import force_uN, slip_speed_um_s, slipped_um
 from microdrivers.estimators.force.selection import all_protocols, settled
@@ -465,6 +465,28 @@ def test_what_check_refuses_is_refused():
         identify(record._replace(force_uN=record.force_uN / 1000.0))
     with pytest.raises(DataError, match="at least 10"):
         identify(part(record, 0.0, 4.7))
+
+
+@pytest.mark.parametrize("count", [-3, 21, 2.5])
+def test_as_many_samples_as_nobody_leaves_out_are_refused(count):
+    with pytest.raises(OutOfRange, match="cannot be left out") as caught:
+        identify(recorded("single"), IdentificationSettings(around_reversal=count))
+    assert "from 0 to 20" in caught.value.remedy
+
+
+def test_a_covariance_that_the_record_does_not_tell_is_not_the_models():
+    fit = identified("single").protocols["single"]
+    assert len(fit.model().covariance) == 9
+    assert dataclasses.replace(fit, covariance=np.full((3, 3), np.inf)).model().covariance == ()
+
+
+def test_lists_are_identified_like_arrays():
+    record = recorded("single")
+    as_lists = record._replace(
+        **{name: getattr(record, name).tolist() for name in ("time_s", "deformation_um", "force_uN")}
+    )
+    expected, found = identified("single"), identify(as_lists)
+    assert found.protocols["single"].springs_and_damper == expected.protocols["single"].springs_and_damper
 
 
 def test_results_are_finite_and_complete():

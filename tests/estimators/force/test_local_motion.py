@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from microdrivers.core.errors import OutOfRange
 from microdrivers.estimators.force.line_fit import Point, broken_line_gains, fit, shape_gain
 from microdrivers.estimators.force.local_motion import InstantMotion, LocalMotion, MotionSettings
 
@@ -159,7 +160,7 @@ def test_parabola_tells_the_acceleration() -> None:
 
 @pytest.mark.parametrize(("lag", "window"), [(3, 20), (9, 9)])
 def test_settings_that_cannot_work_are_refused(lag: int, window: int) -> None:
-    with pytest.raises(ValueError, match="lag"):
+    with pytest.raises(OutOfRange, match="lag"):
         LocalMotion(MotionSettings(lag=lag, window=window))
 
 

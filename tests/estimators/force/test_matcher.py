@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from microdrivers.core.contact_samples import DeformationSample, IndentationSample
+from microdrivers.core.errors import OutOfRange
 from microdrivers.core.samples import ForceSample, Sample
 from microdrivers.estimators.force.matcher import IndentationMatcher, MatcherSettings
 from microdrivers.estimators.force.scatter import RunningScatter
@@ -244,3 +245,20 @@ def test_two_readings_of_the_same_instant() -> None:
     twice = [sample for t in range(40) for sample in (reading(t, t), reading(t, t))]
     (matched,) = fed(IndentationMatcher(), [frame(20.0, exposure_ms=0.0), *twice])
     assert (matched.force_uN, matched.readings) == (20.0, 2)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        MatcherSettings(lateness_s=-1.0),
+        MatcherSettings(lateness_s=math.nan),
+        MatcherSettings(max_gap_s=0.0),
+        MatcherSettings(max_gap_s=math.inf),
+        MatcherSettings(max_waiting=0),
+        MatcherSettings(max_readings=1),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings: MatcherSettings) -> None:
+    with pytest.raises(OutOfRange) as caught:
+        IndentationMatcher(settings)
+    assert caught.value.remedy

@@ -1,11 +1,14 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from microdrivers.core.errors import OutOfRange
 from microdrivers.estimators.force.model import (
     SpecimenModel,
+    check_model,
     force_uN,
     slip_speed_um_s,
     slipped_um,
@@ -49,3 +52,35 @@ def test_stiffness_is_the_slope_of_the_springs():
     x, step = np.array([0.5, 30.0, 120.0]), 1e-4
     numeric = (force_uN(MODEL, x + step, 0.0) - force_uN(MODEL, x - step, 0.0)) / (2.0 * step)
     assert np.allclose(stiffness_uN_per_um(MODEL, x), numeric, rtol=1e-7)
+
+
+def test_a_model_may_have_a_negative_damper_no_covariance_and_no_limits():
+    check_model(MODEL)
+    check_model(MODEL._replace(b_loading_uN_s_per_um=-1.0, covariance=(1.0,) * 9, deepest_um=np.float32(100.0)))
+    check_model(MODEL._replace(slip_um=0.0, slip_rate_per_s=0.0))
+
+
+@pytest.mark.parametrize("name", [name for name in SpecimenModel._fields if name != "covariance"])
+@pytest.mark.parametrize("value", [math.nan, -math.inf, None, "4.5"])
+def test_a_model_with_a_number_that_is_none_is_refused(name, value):
+    with pytest.raises(OutOfRange, match=f"{name} is {value}") as caught:
+        check_model(MODEL._replace(**{name: value}))
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"deepest_um": 0.0},
+        {"fastest_um_s": -1.0},
+        {"residual_uN": -1.0},
+        {"slip_rate_per_s": 0.0},
+        {"slip_rate_per_s": -0.1},
+        {"covariance": (1.0, 2.0)},
+        {"covariance": np.eye(3)},
+        {"covariance": (math.nan,) * 9},
+    ],
+)
+def test_a_model_out_of_range_is_refused(change):
+    with pytest.raises(OutOfRange, match=next(iter(change)).split("_")[0]):
+        check_model(MODEL._replace(**change))

@@ -106,3 +106,9 @@ def test_a_depth_above_the_surface_is_a_touch() -> None:
     touch = speed_limit(SINGLE, max_force_uN=100.0, depth_um=0.0)
     assert touch.speed_um_s == pytest.approx(100.0 / 27.72)
     assert speed_limit(SINGLE, max_force_uN=100.0, depth_um=-20.0) == touch
+
+
+@pytest.mark.parametrize("name", ["k1_uN_per_um", "b_loading_uN_s_per_um", "fastest_um_s", "deepest_um"])
+def test_a_model_that_is_none_allows_no_speed(name: str) -> None:
+    with pytest.raises(OutOfRange, match=name):
+        speed_limit(SINGLE._replace(**{name: math.nan}), max_force_uN=500.0, depth_um=60.0)

@@ -164,3 +164,27 @@ def test_a_record_that_begins_deep_and_ends_free_pulls_nowhere():
     turn = int(np.argmax(record.deformation_um))
     begins = turn - int(0.45 * turn)
     check(part(record, float(record.time_s[begins]), 99.0))
+
+
+@pytest.mark.parametrize("name", ["deformation_sigma_um", "force_sigma_uN"])
+@pytest.mark.parametrize("sigma", [-1.0, np.inf, "0.1", None])
+def test_noise_that_is_none_is_refused(good, name, sigma):
+    refused(good._replace(**{name: sigma}), DataError, f"{name} is ")
+
+
+@pytest.mark.parametrize("column", ["time_s", "deformation_um", "force_uN"])
+def test_a_column_that_holds_no_real_numbers_is_refused(good, column):
+    values = getattr(good, column)
+    refused(good._replace(**{column: values.astype(complex)}), DataError, f"{column} holds complex128")
+    refused(good._replace(**{column: values.astype(str)}), DataError, f"{column} holds str")
+    refused(good._replace(**{column: 5.0}), DataError, "differ in length")
+    masked = np.ma.masked_array(values, mask=np.arange(len(values)) == 300)
+    refused(good._replace(**{column: masked}), DataError, f"{column} is not a number")
+
+
+def test_lists_are_taken_as_arrays(good):
+    columns = [getattr(good, name).tolist() for name in ("time_s", "deformation_um", "force_uN")]
+    found = check(
+        IndentationRecord(*columns, good.deformation_sigma_um, good.force_sigma_uN, lost=[False] * len(columns[0]))
+    )
+    assert all(np.array_equal(one, other) for one, other in zip(found[:3], good[:3], strict=True))

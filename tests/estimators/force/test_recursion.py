@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import pytest
 
 from microdrivers.core.contact_samples import IndentationSample, SpecimenEstimate
+from microdrivers.core.errors import OutOfRange
 from microdrivers.estimators.force.four_samples import Scales
 from microdrivers.estimators.force.onset import ForceOnset
 from microdrivers.estimators.force.recursion import RecursionSettings, SpecimenRecursion
@@ -202,6 +204,15 @@ def test_spikes_gaps_late_and_invalid_samples_do_no_harm() -> None:
     assert estimator.excluded_samples >= 10
 
 
+@pytest.mark.parametrize("approach_um_s", [0.0, 1.0, 5.0])
+def test_contact_is_found_where_the_noise_of_the_deformation_is_not_stated(approach_um_s: float) -> None:
+    estimator = SpecimenRecursion()
+    for seen in indentation(SINGLE, approach_um_s=approach_um_s)[:90]:
+        estimator.update(msgspec.structs.replace(seen, deformation_sigma_um=math.nan))
+    assert estimator.contact is not None
+    assert estimator.contact.contact_um == pytest.approx(0.0, abs=0.1)
+
+
 def test_nothing_is_estimated_without_contact() -> None:
     samples = [sample(k / RATE_HZ, 0.0, 0.02 * (-1) ** k) for k in range(300)]
     estimator = SpecimenRecursion()
@@ -212,3 +223,29 @@ def test_nothing_is_estimated_without_contact() -> None:
 def test_same_samples_give_the_same_bits() -> None:
     samples = indentation(SINGLE, seed=11, depth_um=30.0)
     assert repr(fed(SpecimenRecursion(), samples)) == repr(fed(SpecimenRecursion(), samples))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"forgetting": 0.0},
+        {"forgetting": 1.1},
+        {"forgetting": math.nan},
+        {"branch_forgetting": -0.1},
+        {"clearance": 1},
+        {"least_share": 1.0},
+        {"baseline_sigma_uN": 0.0},
+        {"max_gap_s": 0.0},
+        {"ridge": 0.0},
+        {"lag": 3},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(OutOfRange, match=next(iter(wrong))) as caught:
+        SpecimenRecursion(RecursionSettings(**wrong))
+    assert caught.value.remedy
+
+
+def test_a_contact_point_that_is_no_number_is_refused() -> None:
+    with pytest.raises(OutOfRange, match="contact_um is nan"):
+        SpecimenRecursion(contact_um=math.nan)

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from microdrivers.core.errors import DataError, IllConditioned
+from microdrivers.core.errors import DataError, IllConditioned, OutOfRange
 from microdrivers.estimators.force.ridge import ridge_fit
 
 
@@ -59,8 +59,36 @@ def test_a_column_without_information_gets_nothing():
 
 @pytest.mark.parametrize(
     ("columns", "force"),
-    [(np.ones((3, 4)), np.ones(3)), (np.ones((9, 4)), np.ones(8)), (np.full((9, 4), np.nan), np.ones(9))],
+    [
+        (np.ones((3, 4)), np.ones(3)),
+        (np.ones((9, 4)), np.ones(8)),
+        (np.full((9, 4), np.nan), np.ones(9)),
+        (np.ones((9, 0)), np.ones(9)),
+        (np.ones((9, 1)), np.ones(9, dtype=complex)),
+        (np.ones((9, 1)), np.ma.masked_array(np.ones(9), mask=np.arange(9) == 3)),
+        ([["a"]], [1.0]),
+        ([[1.0], [1.0, 2.0]], [1.0, 1.0]),
+    ],
 )
 def test_what_cannot_be_fitted_is_refused(columns, force):
     with pytest.raises(DataError):
         ridge_fit(columns, force)
+
+
+@pytest.mark.parametrize("ridge", [-1.0, np.nan, np.inf])
+def test_a_ridge_that_is_none_is_refused(ridge):
+    with pytest.raises(OutOfRange, match="the ridge is"):
+        ridge_fit(*regressors(1), ridge=ridge)
+
+
+def test_as_many_samples_as_columns_leave_nothing_to_tell_the_noise_by():
+    fit = ridge_fit(np.eye(3), np.ones(3))
+    assert np.allclose(fit.theta, 1.0)
+    assert fit.degrees_of_freedom == 0
+    assert np.isnan(fit.covariance).all()
+    assert np.isfinite(ridge_fit(np.eye(3)[:, :2], np.ones(3)).covariance).all()
+
+
+def test_lists_are_taken_as_arrays():
+    columns, force = regressors(6)
+    assert np.array_equal(ridge_fit(columns.tolist(), force.tolist()).theta, ridge_fit(columns, force).theta)

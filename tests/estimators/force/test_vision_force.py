@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from microdrivers.core.contact_samples import VisionForceSample
+from microdrivers.core.errors import DataError, OutOfRange
 from microdrivers.estimators.force.indenter import IndentationEstimator
 from microdrivers.estimators.force.matcher import IndentationMatcher
 from microdrivers.estimators.force.vision_force import VisionForce, VisionForceSettings
@@ -233,8 +235,39 @@ def test_longer_lag_is_allowed_and_a_shorter_one_refused() -> None:
     found = fed(VisionForce(PRESETS["single"], VisionForceSettings(lag=8)), frames(record))
     assert len(found) == len(record.t_s) - 8
     assert error_percent(found, record) <= 5.0
-    with pytest.raises(ValueError, match="lag"):
+    with pytest.raises(OutOfRange, match="lag"):
         VisionForce(PRESETS["single"], VisionForceSettings(lag=1))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"max_gap_s": 0.0}, {"max_gap_s": -1.0}, {"max_gap_s": math.nan}, {"lag": 4.5}, {"window": 5}]
+)
+def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]) -> None:
+    with pytest.raises(OutOfRange) as caught:
+        VisionForce(PRESETS["single"], VisionForceSettings(**settings))
+    assert caught.value.remedy
+
+
+def test_a_model_that_is_none_is_refused_before_the_first_frame() -> None:
+    with pytest.raises(OutOfRange, match="covariance has 2 entries"):
+        VisionForce(PRESETS["single"]._replace(covariance=(1.0, 2.0)))
+
+
+def test_a_negative_standard_deviation_is_refused_and_changes_nothing() -> None:
+    samples = frames(indentation(PRESETS["single"], depth_um=10.0))
+    estimator = VisionForce(PRESETS["single"])
+    before = fed(estimator, samples[:40])
+    with pytest.raises(DataError, match="standard deviation -1 µm"):
+        estimator.update(frame(40, samples[40].t_ns / 1e9, 0.0, sigma_um=-1.0))
+    assert repr(before + fed(estimator, samples[40:])) == repr(fed(VisionForce(PRESETS["single"]), samples))
+
+
+def test_noise_that_is_not_stated_is_observed_and_until_then_there_is_no_force() -> None:
+    record = indentation(PRESETS["single"], depth_um=20.0)
+    samples = [frame(s.seq, s.t_ns / 1e9, s.deformation_um, sigma_um=math.nan) for s in frames(record)]
+    found = fed(VisionForce(PRESETS["single"]), samples)
+    assert all(f.flags == {"NO_VELOCITY"} and math.isnan(f.force_uN) for f in found[:9])
+    assert all(math.isfinite(f.force_uN) and math.isfinite(f.sigma_uN) for f in found[9:])
 
 
 def test_sigma_contains_what_the_lag_of_the_velocity_hides() -> None:
@@ -254,15 +287,22 @@ def test_sigma_contains_what_the_lag_of_the_velocity_hides() -> None:
     assert np.mean(off > 3.0 * np.array([f.sigma_uN for f in seen])) < 0.02
 
 
-def test_a_camera_too_slow_for_a_velocity_tells_no_force_but_that_of_springs() -> None:
+@pytest.mark.parametrize("name", list(PRESETS))
+@pytest.mark.parametrize(("rate_hz", "max_gap_s"), [(3.0, 0.25), (30.0, 0.03)])
+def test_a_camera_too_slow_for_a_velocity_tells_no_force(name: str, rate_hz: float, max_gap_s: float) -> None:
+    slow = [frame(k, k / rate_hz, 5.0 / rate_hz * max(k - 6, 0)) for k in range(60)]
+    found = fed(VisionForce(PRESETS[name], VisionForceSettings(max_gap_s=max_gap_s)), slow)
+    assert len(found) > 50
+    assert all(math.isnan(f.force_uN) and math.isnan(f.sigma_uN) and f.flags == {"NO_VELOCITY"} for f in found)
+
+
+def test_a_camera_too_slow_for_a_velocity_tells_the_force_of_springs() -> None:
     preset = PRESETS["single"]
     slow = [frame(k, k / 3.0, 5.0 / 3.0 * max(k - 6, 0)) for k in range(60)]
-    found = fed(VisionForce(preset), slow)
-    assert len(found) > 50
-    assert all(math.isnan(f.force_uN) and f.flags == {"NO_VELOCITY"} for f in found)
     springs = preset._replace(b_loading_uN_s_per_um=0.0, b_unloading_uN_s_per_um=0.0)
     told = fed(VisionForce(springs), slow)
     assert told[-1].force_uN == pytest.approx(4.5161 * told[-1].deformation_um, rel=0.3)
+    assert all(math.isnan(f.velocity_um_s) for f in told)
 
 
 def test_a_force_left_over_where_the_specimen_rests_on_its_way_back_is_flagged() -> None:
