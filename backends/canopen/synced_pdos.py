@@ -102,6 +102,11 @@ class SyncedPdos:
 
     # ------------------------------------------------------------------ life
 
+    @property
+    def listening(self) -> bool:
+        """Whether it takes part in the line's SYNCs."""
+        return bool(self._listening)
+
     def begin_listening(self) -> None:
         """Take part in the line's SYNCs; the nodes should be ready to answer."""
         if not self._listening:

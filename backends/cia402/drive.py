@@ -40,6 +40,7 @@ class Drive:
 
     Attributes:
         ready: it is set up, and its PDOs are on their way.
+        watches_us: it was told to take the end of our heartbeat for a fault; so it may have been if set-up did not end.
         boots: how often it was seen to start.
         referenced: whether it knows its reference.
         fault: the emergency that it reported and nobody has cleared.
@@ -55,7 +56,7 @@ class Drive:
         self.settings = settings
         self.map = AxisMap.from_settings(settings)
         self.watch = AxisWatch(tolerance=self.map.tolerance)
-        self.ready = False
+        self.ready = self.watches_us = False
         self.boots = 0
         self.referenced = False
         self.reading: Reading | None = None
@@ -80,7 +81,7 @@ class Drive:
 
     def forget(self) -> None:
         """The drive has restarted, or may have: nothing that it was told holds any more."""
-        self.ready = False
+        self.ready = self.watches_us = False
         self._written.clear()
         self.watch.switched_off()
 

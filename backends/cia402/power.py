@@ -25,15 +25,18 @@ def rest(clock: Clock) -> None:
 def switch_off(drives: Drives) -> None:
     """Stop what moves, power off at rest, and have the drives not take our leaving for a fault.
 
+    While their PDOs are not listened for, opening is under way: no power stage is on, and a drive cannot be looked at.
+
     Raises:
         LinkError: a drive does not answer; the others are off.
     """
-    there = [drive for drive in drives.all if drive.ready and drive.node.alive]
+    there = [drive for drive in drives.all if drive.watches_us and drive.node.alive]
     if not there:
         return
     failure: MicrodriversError | None = None
     try:
-        _come_to_rest(drives)
+        if drives.pdos.listening:
+            _come_to_rest(drives)
     except MicrodriversError as error:
         failure = error
         drives.stop()

@@ -129,6 +129,7 @@ def set_up(drive: Drive, *, heartbeat_ms: int, clock: Clock) -> None:
     configure_rpdo(node.sdo, 1, drive.control_id, CONTROL_MAPPING)
     configure_tpdo(node.sdo, 1, drive.status_id, STATUS_MAPPING)
     drive.referenced = _knows_its_reference(drive, clock)
+    drive.watches_us = True
     node.consume_heartbeat(HOST_NODE_ID, heartbeat_ms)
     node.command(NmtCommand.START)
     node.produce_heartbeat(heartbeat_ms, timeout_s=MISSED_HEARTBEATS * heartbeat_ms / 1000)

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import stat
+import sys
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,8 @@ SERVED = "microdrivers.served"
 
 AS_JSON = "microdrivers.as_json"
 """In a command's context: whether its standard output is read by another program."""
+
+_INTERRUPTION_MODULE = "microdrivers.core.clock.interruption"
 
 _SERVED_HINT = (
     "these devices are emulated: see that `microdrivers serve` runs, and that this computer is not too busy for it"
@@ -90,9 +93,11 @@ def _may_be_the_servers(error: MicrodriversError) -> bool:
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:
     """Ctrl-C and being terminated: stop the stages, at the next clean moment; a second signal does not wait for it."""
-    from microdrivers.core.clock.interruption import INTERRUPTION
-
-    INTERRUPTION.request()
+    # Not imported here: the signal may have come amid an import of the same modules.
+    interruption = getattr(sys.modules.get(_INTERRUPTION_MODULE), "INTERRUPTION", None)
+    if interruption is None:  # nobody has opened anything
+        raise KeyboardInterrupt
+    interruption.request()
 
 
 def _hang_up(number: int, frame: FrameType | None) -> None:

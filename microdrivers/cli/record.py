@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from microdrivers.cli.exit_codes import EXIT_ERROR
+from microdrivers.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED
 from microdrivers.cli.options import COMPRESSION_HELP, topic_patterns
 from microdrivers.cli.rig_options import RigChoice, rig_options
 
@@ -40,7 +40,8 @@ def _finite(_context: click.Context, _parameter: click.Parameter, duration_s: fl
 @rig_options
 @click.option(
     "--topics", multiple=True, metavar="NAMES",
-    help="Record these alone, separated by commas; patterns are allowed. Default: all but the bytes on wires.",
+    help="Record these alone, separated by commas; patterns are allowed. Default: all but the bytes on wires, of which "
+    "there are many: only names and patterns that end in /wire ask for them, '*/wire' for instance.",
 )  # fmt: skip
 @click.option(
     "--for", "duration_s", type=click.FloatRange(min=0, min_open=True), callback=_finite, metavar="S",
@@ -68,7 +69,8 @@ def record(
 
     Force comes at its sensor's rate, frames at their camera's, poses at 100 Hz, the zoom at 70 Hz. The file is
     complete after Ctrl-C, and whatever kills the program costs the last 0.1 s: see `microdrivers recording repair`.
-    If samples could not be written, they are counted, and the exit status is 1; so it is if one of NAMES met no topic.
+    If samples could not be written, they are counted, and the exit status is 1; so it is if one of NAMES met no topic
+    or no sample. After a Ctrl-C before all devices are open it is 130.
 
     \b
     Examples:
@@ -106,23 +108,68 @@ def record(
     except BaseException:
         rig.close()
         raise
-    ended_by_user = False
+    ended_by_user = begun = False
     try:
         with recorder, rig, ExitStack() as streams:
             _attach_rig(recorder, rig)
             for name, device in rig.devices.items():
                 if recorder.wants(name):
                     streams.enter_context(device.stream(_rate_hz(device)))
+            begun = True
             _run(rig.clock, recorder, duration_s)
     except KeyboardInterrupt:
         ended_by_user = True
     disturbance = recorder.disturbance
-    _tell(recorder, interrupted=ended_by_user, disturbance=disturbance)
+    if not begun and recorder.empty and not disturbance:
+        recorder.file.unlink()
+        click.echo(f"nothing was recorded, and {recorder.file} was removed: not all devices were open yet", err=True)
+        raise KeyboardInterrupt
+    how = "complete"
+    if ended_by_user:
+        how = "ended by you; the file is complete" if begun else "ended by you before all devices were open"
+    silent = _silent(patterns or (), recorder)
+    _tell(recorder, how=how, disturbance=disturbance, silent=silent)
     unmet = _unmet(patterns or (), rig.bus.topics)
     if unmet:
         click.echo(f"there was no topic {_quoted(unmet)}: {_similar(unmet, rig.bus.topics)}", err=True)
-    if disturbance or unmet or recorder.dropped or recorder.failure is not None or not recorder.complete:
+    missed = [topic for topic in silent if not _tells_events(topic)]
+    if missed:
+        click.echo(f"no sample of {_quoted(missed)} came{_needed(missed, rig)}", err=True)
+    if disturbance or unmet or missed or recorder.dropped or recorder.failure is not None or not recorder.complete:
         sys.exit(EXIT_ERROR)
+    if not begun:
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _silent(patterns: Collection[str], recorder: Recorder) -> list[str]:
+    """Topics without a sample for which a pattern asks that has met no other."""
+    from microdrivers.recording.channels import is_wanted
+
+    counts = recorder.counts
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        asked = [topic for topic in counts if is_wanted(topic, [pattern])]
+        if not any(counts[topic].messages or counts[topic].dropped for topic in asked):
+            found |= dict.fromkeys(asked)
+    return list(found)
+
+
+def _tells_events(topic: str) -> bool:
+    """Whether it is silent as long as nothing happens."""
+    from microdrivers.rig.safety import TOPIC
+
+    return topic == TOPIC or topic.endswith("/event")
+
+
+def _needed(topics: Collection[str], rig: Rig) -> str:
+    """What would have let them come, as far as that is known."""
+    from microdrivers.devices.camera import Camera
+    from microdrivers.recording.channels import TRUTH_PREFIX
+
+    cameras = [name for name, device in rig.devices.items() if isinstance(device, Camera)]
+    if not cameras or not any(topic.startswith(TRUTH_PREFIX) for topic in topics):
+        return ""
+    return f": {TRUTH_PREFIX}* tells what was true at a camera's frames; record a camera too, such as {cameras[0]!r}"
 
 
 def _unmet(patterns: Collection[str], topics: Collection[str]) -> list[str]:
@@ -138,8 +185,13 @@ def _quoted(patterns: Collection[str]) -> str:
 
 def _similar(patterns: Collection[str], topics: Collection[str]) -> str:
     """What to ask for instead."""
+    from microdrivers.devices.wire_tap import WIRE_SUFFIX
+    from microdrivers.recording.channels import matches
+
     close = dict.fromkeys(name for pattern in patterns for name in difflib.get_close_matches(pattern, topics, n=1))
     meant = f"did you mean {_quoted(close)}? " if close else ""
+    if any(matches(topic, patterns) for topic in topics if topic.endswith(WIRE_SUFFIX)):
+        meant += f"wires are asked for by a name or pattern that ends in {WIRE_SUFFIX}, such as '*{WIRE_SUFFIX}'; "
     return f"{meant}topics of this rig: {', '.join(topics)}"
 
 
@@ -227,8 +279,9 @@ def _cut(text: str, width: int) -> str:
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"
 
 
-def _tell(recorder: Recorder, *, interrupted: bool, disturbance: str) -> None:
-    how = "ended by you; the file is complete" if interrupted else "complete"
+def _tell(recorder: Recorder, *, how: str, disturbance: str, silent: Collection[str]) -> None:
+    if recorder.empty:
+        how += ", but it holds no samples"
     if not recorder.complete:
         how = "interrupted before its end was written; `microdrivers recording repair` makes it whole"
     if recorder.failure is not None:
@@ -236,7 +289,9 @@ def _tell(recorder: Recorder, *, interrupted: bool, disturbance: str) -> None:
     if disturbance:
         how = disturbance
     click.echo(f"{recorder.file}: {recorder.size / 1e6:.1f} MB, {how}")
-    width = max(map(len, recorder.counts), default=0)
-    for topic, count in recorder.counts.items():
-        if count.messages or count.dropped:
-            click.echo(f"  {topic:<{width}}  {count.messages} samples, {count.dropped} dropped")
+    told = {
+        topic: count for topic, count in recorder.counts.items() if count.messages or count.dropped or topic in silent
+    }
+    width = max(map(len, told), default=0)
+    for topic, count in told.items():
+        click.echo(f"  {topic:<{width}}  {count.messages} samples, {count.dropped} dropped")

@@ -118,6 +118,11 @@ class Recorder:
         return sum(count.dropped for count in tuple(self._out.counts.values()))
 
     @property
+    def empty(self) -> bool:
+        """Whether there was no sample so far, written or dropped."""
+        return not any(count.messages or count.dropped for count in tuple(self._out.counts.values()))
+
+    @property
     def size(self) -> int:
         """Bytes in the file so far."""
         return self._out.size

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 import pytest
 
+from microdrivers.backends.lines.can_line import CanLine
 from microdrivers.core.bus import Bus
+from microdrivers.core.clock import ClockEvent
 from microdrivers.core.errors import (
     BusyError,
     ConfigError,
@@ -232,3 +235,28 @@ def test_a_bus_that_another_program_drives_is_left_alone():
         beats.cancel()
         bench.clock.sleep(2.5)
         bench.opened()
+
+
+def test_an_interrupted_opening_is_no_fault_of_the_drives(monkeypatch, caplog):
+    """Wherever Ctrl-C comes: nobody is told of silent drives, and none takes the end of our heartbeat for a fault."""
+    turn = last = 0
+    wait = CanLine.wait
+
+    def interrupted(line: CanLine, flag: ClockEvent, timeout_s: float) -> bool:
+        nonlocal turn
+        turn += 1
+        if turn == last:
+            raise KeyboardInterrupt
+        return wait(line, flag, timeout_s)
+
+    monkeypatch.setattr(CanLine, "wait", interrupted)
+    with Bench() as bench:
+        while bench.stage.link == "closed":
+            turn, last = 0, last + 3
+            with suppress(KeyboardInterrupt):
+                bench.stage.open()
+            assert not caplog.messages, last
+            if bench.stage.link == "closed":
+                assert not [axis for axis, peer in bench.peers.items() if peer.number(0x1016, 1) & 0xFFFF], last
+                assert all(peer.word == SOD for peer in bench.peers.values()), last
+        last = 0

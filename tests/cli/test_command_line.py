@@ -1,12 +1,14 @@
 """The command line as a user meets it."""
 
 import json
+import signal
 import subprocess
 import sys
 
 import pytest
 from click.testing import CliRunner
 
+from microdrivers.cli import main as main_module
 from microdrivers.cli.main import main
 from microdrivers.configs import shipped_rig
 from microdrivers.results.optics import read_result
@@ -145,3 +147,11 @@ def test_reference_refuses_axes_that_are_not_there(run, axes):
     result = run("reference", shipped_rig("microscope"), "--axes", axes, "--fake")
     assert result.exit_code == 1
     assert "axes to reference" in result.output
+
+
+def test_ctrl_c_while_modules_are_imported_is_no_failed_import(monkeypatch):
+    name = "microdrivers.core.clock.interruption"
+    monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(KeyboardInterrupt):
+        main_module._interrupt(signal.SIGINT, None)
+    assert name not in sys.modules  # an import within another one might meet half a module

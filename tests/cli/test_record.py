@@ -17,6 +17,7 @@ from microdrivers.cli.record import _line
 from microdrivers.configs import shipped_rig
 from microdrivers.core.contact_samples import SpecimenTruth
 from microdrivers.core.samples import ForceSample, Frame
+from microdrivers.devices.camera import Camera
 from microdrivers.recording.reader import Recording
 
 
@@ -188,3 +189,56 @@ def test_ctrl_c_ends_a_recording_that_is_complete(tmp_path):
     assert recording.complete
     assert recording.losses == []
     assert recording.topics["camera_fine"].count > 2
+
+
+def test_topics_that_gave_no_sample_are_told(run, tmp_path):
+    def told(topics):
+        (tmp_path / "a.mcap").unlink(missing_ok=True)
+        return run("record", shipped_rig("microscope"), "--fake", "--for", 0.04, "--out", "a.mcap", "--topics", topics)
+
+    result = told("zoom,truth/optics")
+    assert result.exit_code == 1
+    assert "  truth/optics  0 samples, 0 dropped\n" in result.stdout
+    assert "no sample of 'truth/optics' came: " in result.stderr
+    assert "record a camera too, such as 'camera_fine'" in result.stderr
+    result = told("truth/optics")
+    assert (result.exit_code, "0.0 MB, complete, but it holds no samples\n" in result.stdout) == (1, True)
+    result = told("truth/*,camera_fine")
+    assert (result.exit_code, "no sample of" in result.stderr) == (0, False)
+    result = told("zoom,safety")  # of which nothing is to be heard if all is well
+    assert (result.exit_code, "  safety  0 samples, 0 dropped\n" in result.stdout) == (0, True)
+
+
+def test_how_to_ask_for_wires_is_told(run):
+    remedy = "wires are asked for by a name or pattern that ends in /wire, such as '*/wire'"
+    for topics, meant in (("*can0*", True), ("*wire*", True), ("*cann0*", False)):
+        result = run("record", shipped_rig("workstation"), "--fake", "--for", 0.1, "--topics", topics)
+        assert (result.exit_code, remedy in result.stderr) == (1, meant)
+    assert "end in /wire" in " ".join(run("record", "--help").stdout.split())
+
+
+def test_a_recording_of_sound_wires_tells_of_no_flaw(run, tmp_path):
+    """Drivers may send before they take in what has arrived meanwhile; both stamps are right."""
+    result = run("record", shipped_rig("workstation"), "--fake", "--for", 0.1, "--out", "a.mcap", "--topics", "*/wire")
+    assert result.exit_code == 0, result.output
+    with Recording(tmp_path / "a.mcap") as recording:
+        stamps = [sample.t_ns for _, sample in recording.samples(["CAN socketcan:can0/wire"])]
+        assert recording.flaws == []
+        assert {topic.unsorted for topic in recording.topics.values()} == {0}
+    assert stamps != sorted(stamps)
+
+
+@pytest.mark.parametrize(("topics", "leaves"), [("zoom", False), ("*/event", True)])
+def test_an_interruption_before_all_devices_are_open(run, tmp_path, monkeypatch, topics, leaves):
+    def interrupted(_self: Camera) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Camera, "open", interrupted)
+    result = run("record", shipped_rig("workstation"), "--fake", "--for", 1, "--out", "a.mcap", "--topics", topics)
+    assert result.exit_code == 130
+    assert (tmp_path / "a.mcap").exists() == leaves
+    if leaves:
+        assert "ended by you before all devices were open\n" in result.stdout
+    else:
+        assert "nothing was recorded, and a.mcap was removed" in result.stderr
+        assert "complete" not in result.output
