@@ -29,8 +29,8 @@ def export(file: Path, to: str, topics: tuple[str, ...], out: Path | None) -> No
 
     csv and parquet: one table a topic, time_s since the recording's start, t_ns, then all fields, units in their
     names. hdf5: one file, for h5py and MATLAB, images included. images: numbered PNG files and frames.csv, which
-    `calibrate optics --images` reads if pose and zoom were recorded. video: Motion JPEG, to look at. An export that is
-    killed leaves a hidden folder .export-… in DIR, to be deleted.
+    `calibrate optics --images` reads if pose and zoom were recorded, the stage referenced. video: Motion JPEG at the
+    rate between pauses, to look at. An export that is killed leaves a hidden folder .export-… in DIR, to be deleted.
 
     \b
     Examples:

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from microdrivers.recording.reader import Recording
 
 
+_COUNTS = ("missing", "dropped", "repeated", "unsorted")
+"""Of a topic's samples, what speaks against them."""
+
+
 @click.command(short_help="What a recording holds, and what it has lost.")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
@@ -57,8 +61,10 @@ def describe(recording: Recording) -> dict[str, Any]:
             "rate_hz": topic.rate_hz if math.isfinite(topic.rate_hz) else None,
             "first_s": (topic.first_t_ns - begin_ns) / NS_PER_S if topic.count else None,
             "last_s": (topic.last_t_ns - begin_ns) / NS_PER_S if topic.count else None,
+            "longest_gap_s": topic.longest_gap_s if math.isfinite(topic.longest_gap_s) else None,
             "missing": topic.gaps,
             "dropped": topic.dropped,
+            "repeated": topic.repeated,
             "unsorted": topic.unsorted,
         }
     ends: list[float | None] = [topic["last_s"] for topic in topics.values()]
@@ -94,7 +100,7 @@ def _as_text(found: dict[str, Any]) -> str:
         f"  clock      {_clock(found['clock'])}",
         "",
     ]
-    names = ["topic", "samples", "count", "rate", "from s", "to s", "missing", "dropped", "unsorted"]
+    names = ["topic", "samples", "count", "rate", "from s", "to s", "longest gap s", *_COUNTS]
     rows = [names, *(_row(name, topic) for name, topic in found["topics"].items())]
     widths = [max(len(row[column]) for row in rows) for column in range(len(names))]
     for row in rows:
@@ -124,7 +130,7 @@ def _row(name: str, topic: dict[str, Any]) -> list[str]:
     rate = f"{topic['rate_hz']:.4g} Hz" if tells_rate else "–"
     return [
         name, topic["sample_type"], str(topic["count"]), rate, seconds(topic["first_s"]), seconds(topic["last_s"]),
-        *(str(topic[key]) for key in ("missing", "dropped", "unsorted")),
+        seconds(topic["longest_gap_s"]), *(str(topic[key]) for key in _COUNTS),
     ]  # fmt: skip
 
 

@@ -49,7 +49,13 @@ SampleT = TypeVar("SampleT", bound=Sample)
 
 
 class PoseSample(Sample, frozen=True, gc=False, kw_only=True):
-    """Pose of a stage, all axes at one time; `moving`, `on_target` and `referenced` hold for all axes together."""
+    """Pose of a stage, all axes at one time.
+
+    Attributes:
+        moving: whether any axis moves.
+        on_target: whether all axes are on target.
+        referenced: whether all axes are referenced; if not, positions are no places.
+    """
 
     position_fields: ClassVar[Mapping[str, str]] = {}
     """Name of each axis, and of the field that holds its position; `target_` before it is the target's."""
@@ -70,7 +76,12 @@ class PoseSample(Sample, frozen=True, gc=False, kw_only=True):
 
 
 class XYThetaSample(PoseSample, frozen=True, gc=False, kw_only=True):
-    """Pose of an XYθ stage; `target_*` is the last commanded position (NaN if none)."""
+    """Pose of an XYθ stage.
+
+    Attributes:
+        x_um, y_um, theta_deg: position.
+        target_x_um, target_y_um, target_theta_deg: last commanded position, NaN if none.
+    """
 
     position_fields = {"x": "x_um", "y": "y_um", "theta": "theta_deg"}
 
@@ -83,7 +94,12 @@ class XYThetaSample(PoseSample, frozen=True, gc=False, kw_only=True):
 
 
 class FineStageSample(PoseSample, frozen=True, gc=False, kw_only=True):
-    """Pose of a 3-DOF fine stage in its own axes; `target_*` is the last commanded position (NaN if none)."""
+    """Pose of a 3-DOF fine stage.
+
+    Attributes:
+        x_um, y_um, z_um: position in its own axes.
+        target_x_um, target_y_um, target_z_um: last commanded position, NaN if none.
+    """
 
     position_fields = {"x": "x_um", "y": "y_um", "z": "z_um"}
 
@@ -96,10 +112,15 @@ class FineStageSample(PoseSample, frozen=True, gc=False, kw_only=True):
 
 
 class ForceSample(Sample, frozen=True, gc=False, kw_only=True):
-    """Force along the sensor's axis: `force_uN` = `raw_uN` − `tare_uN`, NaN if the reading is not valid.
+    """Force along the sensor's axis.
 
     Flags: SATURATED (at the end of the range), DISCONNECTED (the amplifier has no sensor), STALE (no new reading has
     come in time), UNTARED (no tare is set; the force is then the raw one).
+
+    Attributes:
+        force_uN: `raw_uN` − `tare_uN`, NaN if the reading is not valid.
+        raw_uN: as the sensor reads.
+        tare_uN: what it reads without a load, as tared; 0 if no tare is set.
     """
 
     force_uN: float
@@ -108,7 +129,14 @@ class ForceSample(Sample, frozen=True, gc=False, kw_only=True):
 
 
 class ZoomSample(Sample, frozen=True, gc=False, kw_only=True):
-    """State of the zoom motor; `zoom` is the reading of the zoom body (0.75 … 11.25 on an SMZ1500)."""
+    """State of the zoom motor.
+
+    Attributes:
+        zoom: reading of the zoom body (0.75 … 11.25 on an SMZ1500).
+        position_steps: of the motor.
+        target_zoom: last commanded zoom, NaN if none.
+        moving, on_target, referenced: of the motor.
+    """
 
     zoom: float
     position_steps: int
@@ -167,10 +195,13 @@ class DeviceEvent(Sample, frozen=True, gc=False, kw_only=True):
 
 
 class TrackedPoint(Sample, frozen=True, gc=False, kw_only=True):
-    """An image feature located in one frame, px from the principal point, v down.
+    """An image feature located in one frame.
 
-    `sigma_px` is the standard deviation per axis that the fit itself predicts. `found` is False when the target
-    is lost; the coordinates are then NaN.
+    Attributes:
+        u_px, v_px: place, px from the principal point, v down; NaN if the target is lost.
+        sigma_px: standard deviation per axis that the fit itself predicts.
+        found: false when the target is lost.
+        frame_seq: `seq` of the frame.
     """
 
     u_px: float

@@ -59,7 +59,9 @@ def columns_of(sample_type: type[Sample]) -> tuple[Column, ...]:
     """The columns of a sample type: its own fields behind those that all samples share; a frame's image is none."""
     known = FrameInfo if sample_type is Frame else sample_type
     types = {field.name: field.type for field in msgspec.structs.fields(known)}
-    described = _descriptions(Sample) | _descriptions(sample_type)
+    described: dict[str, str] = {}
+    for kind in reversed(sample_type.__mro__):
+        described |= _descriptions(kind) if issubclass(kind, Sample) else {}
     columns = []
     for field in fields_of(known):
         shape, length = _shape(field.kind, types[field.name])

@@ -1,7 +1,7 @@
 """A recorded image sequence: a folder with `frames.csv` (file, time_s, x_um, y_um, zoom) and its images.
 
-Further columns and lines that begin with `#` are allowed. Playing it publishes on the same topics, with the same
-sample types, as a live rig does.
+Further columns and lines that begin with `#` are allowed; a frame without a pose or zoom (NaN, or an empty cell) is
+left out. Playing it publishes on the same topics, with the same sample types, as a live rig does.
 """
 
 from __future__ import annotations
@@ -38,14 +38,27 @@ class SequenceRow(NamedTuple):
 class ImageSequence:
     """A sequence that has been read and checked, images excepted.
 
+    Attributes:
+        rows: frames that have a pose and a zoom.
+        flaws: how many frames have none, and were left out.
+
     Raises:
-        ConfigError: no such folder or file, a missing column, a value that is not a finite number, times that do not
-            increase, a named image that does not exist; each with file, line and column.
+        ConfigError: no such folder or file, a missing column, a value that is not a number, times that do not
+            increase, a named image that does not exist, each with file, line and column; no frame with pose and zoom.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.rows = _read_rows(folder)
+        rows = _read_rows(folder)
+        self.rows = [row for row in rows if not any(map(math.isnan, (row.x_um, row.y_um, row.zoom)))]
+        self.flaws = _lacking(rows)
+        if not self.rows:
+            raise ConfigError(
+                f"no frame has both a pose and a zoom ({'; '.join(self.flaws)})",
+                file=str(folder / "frames.csv"),
+                remedy="record again with the stage referenced (`microdrivers reference`), stage and zoom included; "
+                "an export has no pose where the stage was not referenced",
+            )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -119,7 +132,7 @@ def _read_rows(folder: Path) -> list[SequenceRow]:
             "an image sequence needs a frames.csv",
             file=str(folder), remedy=f"add frames.csv with the columns {', '.join(COLUMNS)}",
         )  # fmt: skip
-    table = Table(file, columns=COLUMNS, numeric=COLUMNS[1:], positive=("zoom",))
+    table = Table(file, columns=COLUMNS, numeric=COLUMNS[1:], positive=("zoom",), may_be_nan=COLUMNS[2:])
     return [_sequence_row(table, row) for row in table.rows]
 
 
@@ -134,6 +147,15 @@ def _sequence_row(table: Table, row: TableRow) -> SequenceRow:
     return SequenceRow(
         row.line, image, seconds_to_ns(numbers["time_s"]), numbers["x_um"], numbers["y_um"], numbers["zoom"]
     )
+
+
+def _lacking(rows: list[SequenceRow]) -> tuple[str, ...]:
+    """What frames lack, and how many of them."""
+    lacking = {
+        "a pose (x_um, y_um)": sum(math.isnan(row.x_um) or math.isnan(row.y_um) for row in rows),
+        "a zoom": sum(math.isnan(row.zoom) for row in rows),
+    }
+    return tuple(f"frames without {what}: {number} of {len(rows)}" for what, number in lacking.items() if number)
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -22,7 +22,9 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
         sample_type: of its samples.
         count: how many samples can be read.
         first_t_ns, last_t_ns: earliest and latest instant, ns on the rig's clock; 0 if there are none.
-        rate_hz: mean rate between these; NaN with fewer than two different instants.
+        rate_hz: that of the median interval from one instant to the next, so that pauses do not count; of a long
+            recording, of a few thousand intervals, evenly spread. NaN if no sample is later than those before it.
+        longest_gap_s: longest time from one instant to the next; NaN as above.
         gaps: how many `seq` numbers are missing between the lowest and the highest.
         repeated: how many stand in the file once more, by their `order`.
         unsorted: how many samples describe an instant before their predecessor's. None on wires: what passes there
@@ -35,6 +37,7 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
     first_t_ns: int
     last_t_ns: int
     rate_hz: float
+    longest_gap_s: float
     gaps: int
     repeated: int
     unsorted: int
@@ -48,6 +51,9 @@ def unexplained_gaps(topics: Mapping[str, TopicSummary]) -> list[str]:
         for name, topic in topics.items()
         if topic.gaps > topic.dropped
     ]
+
+
+_MOST_INTERVALS = 8192
 
 
 class Survey:
@@ -101,7 +107,8 @@ class _Count:
     """The running figures of one topic."""
 
     __slots__ = (
-        "count", "first_ns", "first_seq", "last_ns", "last_seq", "orders", "previous_ns", "sample_type", "unsorted"
+        "count", "every", "first_ns", "first_seq", "intervals_ns", "last_ns", "last_seq", "longest_ns", "orders",
+        "previous_ns", "sample_type", "steps", "unsorted",
     )  # fmt: skip
 
     def __init__(self, sample_type: type[Sample]) -> None:
@@ -110,12 +117,18 @@ class _Count:
         self.last_seq = -1
         self.first_ns = self.last_ns = self.previous_ns = 0
         self.orders = array("q")
+        self.longest_ns = self.steps = 0
+        self.every = 1
+        self.intervals_ns = array("d")
+        """One of `every` intervals: enough for their median, however long the recording."""
 
     def add(self, t_ns: int, seq: int, order: int) -> None:
         if self.count:
             self.unsorted += t_ns < self.previous_ns
             self.first_ns = min(self.first_ns, t_ns)
-            self.last_ns = max(self.last_ns, t_ns)
+            if t_ns > self.last_ns:
+                self._add_interval(t_ns - self.last_ns)
+                self.last_ns = t_ns
             if seq > self.last_seq:  # usually; threads publish side by side, and may overtake each other
                 self.last_seq = seq
             elif seq < self.first_seq:
@@ -127,12 +140,22 @@ class _Count:
         self.orders.append(order)
         self.previous_ns = t_ns
 
+    def _add_interval(self, interval_ns: int) -> None:
+        self.longest_ns = max(self.longest_ns, interval_ns)
+        if self.steps % self.every == 0:
+            self.intervals_ns.append(interval_ns)
+            if len(self.intervals_ns) == _MOST_INTERVALS:
+                del self.intervals_ns[1::2]
+                self.every *= 2
+        self.steps += 1
+
     def summary(self, dropped: int) -> TopicSummary:
-        span_ns = self.last_ns - self.first_ns
+        has_times = bool(self.intervals_ns)
         repeated = self.count - len(np.unique(self.orders))
         return TopicSummary(
             sample_type=self.sample_type, count=self.count, first_t_ns=self.first_ns, last_t_ns=self.last_ns,
-            rate_hz=(self.count - 1) * NS_PER_S / span_ns if span_ns else float("nan"),
+            rate_hz=NS_PER_S / float(np.median(self.intervals_ns)) if has_times else float("nan"),
+            longest_gap_s=self.longest_ns / NS_PER_S if has_times else float("nan"),
             gaps=max(0, self.last_seq - self.first_seq + 1 - self.count + repeated), repeated=repeated,
             unsorted=0 if self.sample_type is WireTraffic else self.unsorted, dropped=dropped,
         )  # fmt: skip

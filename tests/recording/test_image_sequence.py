@@ -94,7 +94,18 @@ def test_a_missing_column_is_named(sequence):
         ImageSequence(sequence)
 
 
-@pytest.mark.parametrize("value", ["", "abc", "nan", "1.0 um"])
+def test_frames_without_a_pose_or_a_zoom_are_left_out_and_told(sequence, tmp_path):
+    edit_cell(sequence, 2, "zoom", "nan")
+    edit_cell(sequence, 2, "y_um", "")
+    ran = calibrate(sequence, tmp_path / "out")
+    assert ran.exit_code == 0, ran.output
+    found = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert found["frames"] == 9
+    told = ["frames without a pose (x_um, y_um): 1 of 10, left out.", "frames without a zoom: 1 of 10, left out."]
+    assert [note.partition("flaw: ")[2] for note in found["notes"] if "flaw" in note] == told
+
+
+@pytest.mark.parametrize("value", ["abc", "inf", "1.0 um"])
 def test_a_value_that_is_no_number_has_its_line_and_column(sequence, value):
     edit_cell(sequence, 4, "y_um", value)
     with pytest.raises(ConfigError, match=r"frames\.csv:4:4: y_um: .*not a finite number"):

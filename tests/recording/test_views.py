@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from microdrivers.core.errors import UnsupportedError
-from microdrivers.core.samples import Frame, OpticsEstimate, Sample
+from microdrivers.core.samples import (
+    FineStageSample,
+    ForceSample,
+    Frame,
+    OpticsEstimate,
+    Sample,
+    TrackedPoint,
+    XYThetaSample,
+    ZoomSample,
+)
 from microdrivers.recording.columns import columns_of, unit_of
 from microdrivers.recording.reader import Recording
 from microdrivers.recording.schemas import UnsupportedType, fields_of, sample_types
@@ -41,6 +50,11 @@ def test_descriptions_are_those_of_the_sample_type():
     assert described["x_um"] == described["y_um"] == "stage pose at mid-exposure"
     assert described["scale_px_per_um"].startswith("M, the similarity")
     assert {column.name for column in columns_of(Sample)} == set(Sample.__struct_fields__)
+
+
+@pytest.mark.parametrize("kind", [XYThetaSample, FineStageSample, ForceSample, ZoomSample, TrackedPoint, Frame])
+def test_what_devices_publish_is_described(kind):
+    assert [column.name for column in columns_of(kind) if not column.description] == []
 
 
 def test_structured_array(recorded):

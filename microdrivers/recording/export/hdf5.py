@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +124,7 @@ class Hdf5File:
 class Hdf5Topic:
     """Writes one topic."""
 
-    left_out = 0
+    remarks: Sequence[str] = ()
 
     def __init__(
         self,

@@ -26,13 +26,15 @@ _RIFF = struct.Struct("<4sI")
 
 
 class Track(NamedTuple):
-    """Recorded values over time: t_ns, and one array a field."""
+    """Recorded values of a topic over time: t_ns, and one array a field, NaN where a stage was not referenced."""
 
+    topic: str
+    referenced: bool
     t_ns: npt.NDArray[np.int64]
     values: Mapping[str, npt.NDArray[np.float64]]
 
     def at(self, t_ns: int) -> dict[str, float]:
-        """The values of one instant, linear between samples; NaN before the first and after the last."""
+        """The values of one instant, linear between samples; NaN before the first, after the last and beside a NaN."""
         since = (self.t_ns - t_ns).astype(float)
         return {
             name: float(np.interp(0.0, since, array, left=math.nan, right=math.nan))
@@ -53,8 +55,11 @@ def track_of(recording: Recording, camera: str) -> list[Track]:
         topic = names.get(key) if names.get(key) in there else there[0] if len(there) == 1 else None
         if topic is not None:
             samples = sorted((s for _, s in recording.samples([literal(topic)])), key=lambda sample: sample.t_ns)
-            values = {field: np.array([getattr(sample, field) for sample in samples]) for field in fields}
-            tracks.append(Track(np.array([sample.t_ns for sample in samples], dtype=np.int64), values))
+            # The pose of a stage without its reference is not a place; a zoom is used as it reads, as in a live run.
+            known = [not isinstance(s, XYThetaSample) or s.referenced for s in samples]
+            values = {field: np.where(known, [getattr(s, field) for s in samples], math.nan) for field in fields}
+            t_ns = np.array([sample.t_ns for sample in samples], dtype=np.int64)
+            tracks.append(Track(topic, all(known), t_ns, values))
     return tracks
 
 
@@ -65,7 +70,6 @@ class ImageFolder:
     """
 
     batch = 1
-    left_out = 0
 
     def __init__(self, folder: Path, tracks: list[Track], *, start_ns: int) -> None:
         folder.mkdir()
@@ -73,6 +77,7 @@ class ImageFolder:
         self._tracks = tracks
         self._start_ns = start_ns
         self._count = 0
+        self._lacking = [0 for _ in tracks]
         self._before: int | None = None
         self._stream = (folder / "frames.csv").open("x", encoding="utf-8", newline="")
         self._table = csv.writer(self._stream, lineterminator="\n")
@@ -89,12 +94,24 @@ class ImageFolder:
             if not done:
                 raise MicrodriversError(f"frame {frame.seq} could not be made a PNG", remedy="export to hdf5")
             (self._folder / name).write_bytes(data.tobytes())
-            places = [value for track in self._tracks for value in track.at(frame.t_ns).values()]
+            found = [[*track.at(frame.t_ns).values()] for track in self._tracks]
+            self._lacking = [n + any(map(math.isnan, f)) for n, f in zip(self._lacking, found, strict=True)]
+            places = [value for values in found for value in values]
             time_s = (frame.t_ns - self._start_ns) / NS_PER_S
             missing = 0 if self._before is None else max(0, frame.seq - self._before - 1)
             self._table.writerow([name, time_s, *places, *(getattr(frame, field) for field in _INFO), missing])
             self._before = frame.seq
             self._count += 1
+
+    @property
+    def remarks(self) -> list[str]:
+        """Which values the table lacks."""
+        return [
+            f"frames without {', '.join(track.values)} in frames.csv: {lacking} of {self._count}, since "
+            f"{track.topic} {'has no sample before or after them' if track.referenced else 'was not referenced'}"
+            for track, lacking in zip(self._tracks, self._lacking, strict=True)
+            if lacking
+        ]
 
     def close(self) -> None:
         """Complete the table."""
@@ -107,14 +124,13 @@ class ImageFolder:
 class VideoFile:
     """Writes frames as Motion JPEG at a constant rate: lossy, 8 bit, without their times. To look at, not to measure.
 
-    Attributes:
-        left_out: frames of another size than the first one.
+    `rate_hz` is that of the frames while there is no pause; NaN if it is not known.
     """
 
     batch = 1
 
     def __init__(self, file: Path, *, rate_hz: float) -> None:
-        self.left_out = 0
+        self._left_out = 0
         self._file = file
         self._rate_hz = rate_hz if math.isfinite(rate_hz) and rate_hz > 0 else 30.0
         self._shape: tuple[int, ...] = ()
@@ -134,7 +150,14 @@ class VideoFile:
                 self._writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
                 self._written += 1
             else:
-                self.left_out += 1
+                self._left_out += 1
+
+    @property
+    def remarks(self) -> list[str]:
+        """How it plays, and how many frames it lacks."""
+        plays = f"it plays at {self._rate_hz:.4g} frames per second, without the pauses between frames"
+        lacks = f"{self._left_out} frames of another size than the first one were left out"
+        return [plays, lacks] if self._left_out else [plays]
 
     def _open(self, shape: tuple[int, ...]) -> None:
         import cv2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, get_args
@@ -30,14 +30,13 @@ _REPORT_EVERY = 100
 
 
 class TopicWriter(Protocol):
-    """Writes one topic, `batch` samples at a time.
-
-    Attributes:
-        left_out: samples that have no place in the file.
-    """
+    """Writes one topic, `batch` samples at a time."""
 
     batch: int
-    left_out: int
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What is to be told of the closed file, and of what it lacks."""
 
     def write(self, samples: list[Sample]) -> None:
         """Append samples."""
@@ -103,11 +102,7 @@ def export_recording(
             written = _write_batches(recording, writers, keeps_images=to in _WITH_IMAGES, on_progress=on_progress)
         for writer in writers.values():
             writer.verify()
-    remarks = [
-        f"{topic}: {writer.left_out} frames of another size than the first one were left out"
-        for topic, writer in writers.items()
-        if writer.left_out
-    ]
+    remarks = [f"{topic}: {remark}" for topic, writer in writers.items() for remark in writer.remarks]
     if flaws:
         remarks.append(f"{out / told}: what is wrong with the recording")
     by_file = Counter[Path]()

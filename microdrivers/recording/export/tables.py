@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import numpy as np
 
 from microdrivers.core.samples import Sample
 from microdrivers.recording.columns import columns_of, describe
-from microdrivers.recording.views import Array, arrays_of, flattened, optional_module
+from microdrivers.recording.views import Array, arrays_of, flattened, optional_module, unit_of_column
 
 BATCH_SAMPLES = 16_384
+_PANDAS_ATTRIBUTES = "PANDAS_ATTRS"
+"""Under this key of a file's metadata, pandas keeps a DataFrame's `attrs`."""
 
 
 class CsvTopic:
@@ -23,7 +26,7 @@ class CsvTopic:
     """
 
     batch = BATCH_SAMPLES
-    left_out = 0
+    remarks: Sequence[str] = ()
 
     def __init__(self, file: Path, sample_type: type[Sample], *, start_ns: int) -> None:
         self._stream = file.open("x", encoding="utf-8", newline="")
@@ -46,14 +49,14 @@ class CsvTopic:
 
 
 class ParquetTopic:
-    """Writes one topic; fields carry `unit` and `description` as metadata.
+    """Writes one topic; fields carry `units` and `description` as metadata, pandas' `attrs` those of `data_frame`.
 
     Raises:
         UnsupportedError: pyarrow is not installed.
     """
 
     batch = BATCH_SAMPLES
-    left_out = 0
+    remarks: Sequence[str] = ()
 
     def __init__(self, file: Path, sample_type: type[Sample], *, topic: str, start_ns: int) -> None:
         self._arrow = optional_module("pyarrow")
@@ -61,7 +64,12 @@ class ParquetTopic:
         self._type = sample_type
         self._start_ns = start_ns
         about = {"topic": topic, "sample_type": sample_type.__name__, "description": describe(sample_type)}
-        self._schema = self._arrow.schema(self._fields(), metadata=about | {"start_ns": str(start_ns)})
+        fields = self._fields()
+        units = {field.name: unit_of_column(field.name) for field in fields}
+        attrs = json.dumps(about | {"start_ns": start_ns, "units": units})
+        self._schema = self._arrow.schema(
+            fields, metadata=about | {"start_ns": str(start_ns), _PANDAS_ATTRIBUTES: attrs}
+        )
         self._writer = parquet.ParquetWriter(str(file), self._schema)
 
     def _fields(self) -> list[Any]:
@@ -70,11 +78,11 @@ class ParquetTopic:
             "double": arrow.float64(), "doubles": arrow.float64(), "int": arrow.int64(), "ints": arrow.int64(),
             "bool": arrow.bool_(),
         }  # fmt: skip
-        fields = [arrow.field("time_s", arrow.float64(), metadata={"unit": "s"})]
+        fields = [arrow.field("time_s", arrow.float64(), metadata={"units": "s"})]
         for column in columns_of(self._type):
             kind = kinds.get(column.kind, arrow.string())
             kind = arrow.list_(kind) if column.shape == "any" else kind
-            about = {"unit": column.unit, "description": column.description}
+            about = {"units": column.unit, "description": column.description}
             names = [f"{column.name}_{n}" for n in range(column.length)] if column.shape == "fixed" else [column.name]
             fields += [arrow.field(name, kind, metadata=about) for name in names]
         return fields

@@ -24,13 +24,13 @@ class SequencePlayback:
         ConfigError: it has fewer.
     """
 
-    past_run = PastRun()
     past_settings = None
 
     def __init__(self, sequence: ImageSequence, *, target: TargetKind = "texture", frames: int | None = None) -> None:
         self.bus = Bus()
         self.clock: Clock = SimulatedClock()
         self.names = SourceNames("stage", "zoom", "camera")
+        self.past_run = PastRun(flaws=tuple(f"{flaw}, left out" for flaw in sequence.flaws))
         self._sequence = sequence
         self._frames = frames_taken(frames, len(sequence), source=str(sequence.folder))
         self._target: TargetKind = target

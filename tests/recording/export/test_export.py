@@ -7,16 +7,18 @@ import sys
 import cv2
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 from pyarrow import parquet
 
 from microdrivers.core.errors import ConfigError, UnsupportedError
-from microdrivers.core.samples import Frame, OpticsTruth
+from microdrivers.core.samples import Frame, OpticsTruth, XYThetaSample, ZoomSample
 from microdrivers.recording.export import export_recording
 from microdrivers.recording.export.pictures import eight_bit
 from microdrivers.recording.export.target import file_names
 from microdrivers.recording.image_sequence import ImageSequence
 from microdrivers.recording.reader import Recording
+from microdrivers.recording.views import data_frame
 
 
 @pytest.fixture
@@ -50,8 +52,11 @@ def test_parquet(exported, recorded, tmp_path):
     exported("parquet")
     table = parquet.read_table(tmp_path / "out" / "force.parquet")
     assert table["force_uN"].to_pylist() == [s.force_uN for s in samples(recorded, "force")]
-    assert table.schema.field("force_uN").metadata[b"unit"] == b"uN"
+    assert table.schema.field("force_uN").metadata[b"units"] == b"uN"
     assert table.schema.metadata[b"topic"] == b"force"
+    with Recording(recorded.file) as recording:
+        for topic in ("force", "camera"):
+            assert pd.read_parquet(tmp_path / "out" / f"{topic}.parquet").attrs == data_frame(recording, topic).attrs
 
 
 def test_hdf5(exported, recorded, tmp_path):
@@ -114,7 +119,7 @@ def test_hdf5_of_frames_that_change_and_tuples_of_any_length(stage, tmp_path):
     table = parquet.read_table(tmp_path / "parquet" / "truth-optics.parquet")
     assert table["corners_px"].to_pylist() == [[1.0, 2.0], [3.0, 4.0], []]
     report = export_recording(Recording(stage.file), "video", tmp_path / "video")
-    assert "1 frames of another size" in report.remarks[0]
+    assert "1 frames of another size" in report.remarks[1]
 
 
 def test_images_are_a_sequence_again(optics_recording, tmp_path):
@@ -127,6 +132,41 @@ def test_images_are_a_sequence_again(optics_recording, tmp_path):
     assert [row.zoom for row in sequence.rows] == [s.zoom for s in published["zoom"]]
     for row, frame in zip(sequence.rows, published["camera"], strict=True):
         assert np.array_equal(sequence.load(row), frame.image)
+
+
+def record_a_drive(stage, *, referenced):
+    """Ten poses, ten frames, and a zoom that comes before the fourth of them."""
+    with stage.recorder():
+        for seq in range(10):
+            stage.clock.sleep(0.03)
+            about = {"t_ns": stage.clock.now_ns(), "seq": seq, "moving": False, "on_target": True}
+            known = {"referenced": referenced(seq), "x_um": 5.0 * seq, "y_um": -2.0 * seq, "theta_deg": 0.0}
+            stage.publish("table", XYThetaSample(device="table", **known, **about))
+            if seq >= 3:
+                stage.publish("zoom", ZoomSample(device="zoom", zoom=1.5, position_steps=9, referenced=False, **about))
+            stage.frame(seq)
+
+
+def test_frames_without_a_pose_or_a_zoom_are_left_out_of_a_sequence(stage, tmp_path):
+    record_a_drive(stage, referenced=lambda seq: seq < 8)
+    with Recording(stage.file) as recording:
+        report = export_recording(recording, "images", tmp_path)
+    assert report.remarks == [
+        "camera: frames without x_um, y_um in frames.csv: 2 of 10, since table was not referenced",
+        "camera: frames without zoom in frames.csv: 3 of 10, since zoom has no sample before or after them",
+    ]
+    sequence = ImageSequence(tmp_path / "camera")
+    assert [(row.x_um, row.y_um, row.zoom) for row in sequence.rows] == [(5.0 * s, -2.0 * s, 1.5) for s in range(3, 8)]
+    assert sequence.flaws == ("frames without a pose (x_um, y_um): 2 of 10", "frames without a zoom: 3 of 10")
+
+
+def test_poses_of_a_stage_that_was_never_referenced_are_no_places(stage, tmp_path):
+    record_a_drive(stage, referenced=lambda _: False)
+    with Recording(stage.file) as recording:
+        export_recording(recording, "images", tmp_path)
+    with pytest.raises(ConfigError, match=r"frames without a pose \(x_um, y_um\): 10 of 10") as caught:
+        ImageSequence(tmp_path / "camera")
+    assert "with the stage referenced" in caught.value.remedy
 
 
 def test_what_a_damaged_recording_lacks_is_told_beside_what_is_exported(optics_recording, tmp_path):
@@ -167,6 +207,19 @@ def test_video(exported, tmp_path):
     video = cv2.VideoCapture(str(tmp_path / "out" / "camera.avi"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 10
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20, rel=0.01)
+    video.release()
+
+
+def test_a_video_plays_at_the_rate_between_pauses(stage, tmp_path):
+    with stage.recorder():
+        for seq in range(20):
+            stage.clock.sleep(2.0 if seq % 5 == 0 else 0.04)
+            stage.frame(seq)
+    with Recording(stage.file) as recording:
+        report = export_recording(recording, "video", tmp_path)
+    assert report.remarks == ["camera: it plays at 25 frames per second, without the pauses between frames"]
+    video = cv2.VideoCapture(str(tmp_path / "camera.avi"))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(25, rel=0.01)
     video.release()
 
 
