@@ -22,6 +22,9 @@ Stages = Mapping[str, Mapping[str, Axis]]
 _SHARE_OF_WAY = 0.72
 """Of the probe's way from its zero to the end of its travel, until it meets the surface."""
 
+_AHEAD_UM = 60.0
+"""Of the tip at its place before the specimen, where the rig file states that: the surface."""
+
 _REACH_UM = 200.0
 _MOST_UPRIGHT = 0.7
 _AXES = ("x", "y", "z")
@@ -42,12 +45,18 @@ class Tool(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """A force sensor that can press on a specimen. `direction` is a unit vector in the rig's frame, into it."""
+    """A force sensor that can press on a specimen.
+
+    Attributes:
+        direction: a unit vector in the rig's frame, into it.
+        ready_um: where the tip is before it, in the rig's frame; None if the rig file does not say.
+    """
 
     sensor: str
     tool: Tool
     direction: Array
     stiffness_uN_per_um: float
+    ready_um: Array | None
 
 
 def find_probe(rig: Mapping[str, Any]) -> Probe | None:
@@ -56,7 +65,8 @@ def find_probe(rig: Mapping[str, Any]) -> Probe | None:
     It must be carried by a fine stage with `origin_um`, and push sideways rather than down.
     """
     devices = rig.get("devices", {})
-    named = (rig.get("probe") or {}).get("force")
+    stated = rig.get("probe") or {}
+    named, ready = stated.get("force"), stated.get("ready_um")
     for name, section in devices.items():
         carrier = section.get("carried_by")
         if "range_uN" not in section or named not in (None, name) or carrier not in devices:
@@ -65,7 +75,9 @@ def find_probe(rig: Mapping[str, Any]) -> Probe | None:
         axis = np.array(section.get("axis") or (0.0, 0.0, 1.0), dtype=np.float64)
         length = float(np.linalg.norm(axis))
         if tool is not None and length > 0.0 and abs(axis[2]) < _MOST_UPRIGHT * length:
-            return Probe(name, tool, -axis / length, float(section.get("stiffness_uN_per_um") or math.inf))
+            ready_um = None if ready is None else tool.origin_um + tool.ways @ np.array(ready, dtype=np.float64)
+            stiffness = float(section.get("stiffness_uN_per_um") or math.inf)
+            return Probe(name, tool, -axis / length, stiffness, ready_um)
     return None
 
 
@@ -189,6 +201,8 @@ class Specimen:
 
 def nominal_surface_um(probe: Probe) -> Array:
     """Where on the probe's line, in the rig's frame, the surface of a specimen should be."""
+    if probe.ready_um is not None:
+        return np.asarray(probe.ready_um + _AHEAD_UM * probe.direction)
     shares = probe.direction @ probe.tool.ways
     leading = int(np.abs(shares).argmax())
     way_um = float((shares[leading] * probe.tool.travel_um[leading]).max())

@@ -6,9 +6,10 @@ import contextlib
 import shlex
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -16,9 +17,10 @@ from microdrivers.cli.options import fields_given, refuse_options_given
 from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws, write_results
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 from microdrivers.cli.run_output import RECORDING, RESULT, RecordingChoice, RunOutput, recording_options
-from microdrivers.core.protocol_names import PROTOCOLS
+from microdrivers.core.protocol_names import MOST_AROUND_REVERSAL, PROTOCOLS
 
 if TYPE_CHECKING:
+    from microdrivers.core.errors import MicrodriversError
     from microdrivers.core.protocol_names import ProtocolName
     from microdrivers.estimators.force.identify import IdentificationSettings
     from microdrivers.report.force_truth import ContactTruthCollector
@@ -52,7 +54,7 @@ _QUESTION = "Is the specimen held, the probe aligned with it, and nothing else i
 @click.option("--hold-s", type=click.FloatRange(min=0.0), default=0.0, show_default=True, help="Wait when deepest.")
 @click.option("--check/--no-check", default=True, show_default=True, help="Press again, force from the camera alone.")
 @click.option(
-    "--leave-out", type=click.IntRange(0, 20), default=2, show_default=True,
+    "--leave-out", type=click.IntRange(0, MOST_AROUND_REVERSAL), default=2, show_default=True,
     help="Samples not fitted on either side of contact, reversals and release.",
 )  # fmt: skip
 @click.option(
@@ -111,17 +113,19 @@ def force(
     try:
         if of_old_data:
             _refuse_rig_options(table, replay)
+        opened: AbstractContextManager[_Opened]
         if table is not None:
-            status = _from_table(table, specimen, settings, output)
+            opened, check = _from_table(table, specimen, settings), False
         elif replay is not None:
-            status = _from_recording(replay, check, settings, output)
+            opened = _from_recording(replay, settings)
         else:
             _check_figures(press)
             emulated = fake or rig_file is None
             if not emulated and not yes:
                 _ask(rig_file or shipped_rig())
             choice = RigChoice(rig_file or shipped_rig(), emulated, seed, world, wire_log)
-            status = _on_rig(choice, specimen, calibration, press, check, settings, real_time, output)
+            opened = _on_rig(choice, specimen, calibration, press, settings, real_time)
+        status = _run(opened, check, output)
     finally:
         output.close()
     if status:
@@ -157,7 +161,16 @@ def _refuse_rig_options(table: Path | None, replay: Path | None) -> None:
     )  # fmt: skip
 
 
-def _from_recording(file: Path, check: bool, settings: IdentificationSettings, output: RunOutput) -> int:
+class _Opened(NamedTuple):
+    """Whoever publishes the samples, what is known of it, and how the specimen is identified."""
+
+    source: IndentationSource
+    known: dict[str, Any]
+    settings: IdentificationSettings
+
+
+@contextlib.contextmanager
+def _from_recording(file: Path, settings: IdentificationSettings) -> Iterator[_Opened]:
     from microdrivers.recording.reader import Recording
     from microdrivers.routines.force import IndentationReplay
 
@@ -166,27 +179,27 @@ def _from_recording(file: Path, check: bool, settings: IdentificationSettings, o
         source = IndentationReplay(recording)
         if source.past_settings is not None:
             settings = source.past_settings._replace(**fields_given(settings, _SETTINGS))
-        return _run(source, describe_recorded(recording), check, settings, output)
+        yield _Opened(source, describe_recorded(recording), settings)
 
 
-def _from_table(file: Path, specimen: str | None, settings: IdentificationSettings, output: RunOutput) -> int:
+@contextlib.contextmanager
+def _from_table(file: Path, specimen: str | None, settings: IdentificationSettings) -> Iterator[_Opened]:
     from microdrivers.recording.indentation_table import IndentationTable
     from microdrivers.routines.force import IndentationPlayback
 
     known = {"source": f"recorded indentation {file}", "clock": "recorded", "settings": {"specimen": specimen}}
-    return _run(IndentationPlayback(IndentationTable(file)), known, False, settings, output)
+    yield _Opened(IndentationPlayback(IndentationTable(file)), known, settings)
 
 
+@contextlib.contextmanager
 def _on_rig(
     choice: RigChoice,
     specimen: str | None,
     calibration: Path | None,
     press: dict[str, Any],
-    check: bool,
     identification: IdentificationSettings,
     real_time: bool,
-    output: RunOutput,
-) -> int:
+) -> Iterator[_Opened]:
     from microdrivers.core.clock import SimulatedClock, SystemClock
     from microdrivers.rig import open_rig
     from microdrivers.routines.force import PressExperiment, PressSettings, Sight
@@ -205,7 +218,7 @@ def _on_rig(
         settings = PressSettings(**press)
         sight = Sight.calibrated(rig, calibration) if calibration is not None else Sight()
         known = describe_rig(rig, fake=fake, seed=seed, settings=settings._asdict() | {"specimen": specimen})
-        return _run(PressExperiment(rig, settings, sight=sight), known, check, identification, output)
+        yield _Opened(PressExperiment(rig, settings, sight=sight), known, identification)
 
 
 @contextlib.contextmanager
@@ -222,47 +235,79 @@ def _naming_the_option() -> Iterator[None]:
         raise
 
 
-def _run(
-    source: IndentationSource, known: dict[str, Any], check: bool, settings: IdentificationSettings, output: RunOutput
-) -> int:
+def _run(opened: AbstractContextManager[_Opened], check: bool, output: RunOutput) -> int:
+    """Measure, then close whatever was open, and only then write: Ctrl-C may end that at any moment."""
+    from microdrivers.core.clock.interruption import INTERRUPTION
     from microdrivers.core.errors import MicrodriversError
-    from microdrivers.report.force_summary import force_summary
     from microdrivers.report.force_truth import ContactTruthCollector
     from microdrivers.routines.force import Characterisation
 
-    known["settings"] = known.get("settings", {}) | settings._asdict()
-    truth = ContactTruthCollector(source.bus)
-    with output.recorded(source, known):
-        characterisation = Characterisation(source, on_host=output.follow, settings=settings)
-        try:
-            run = characterisation.run(output.progress, check=check)
-        except MicrodriversError as error:
-            found = characterisation.partial(error)
-            _tell_what_is_left(characterisation, known, truth, found, output)
-            click.echo(source.whereabouts, nl=bool(source.whereabouts), err=True)
-            if characterisation.interrupted:
+    characterisation = run = None
+    try:
+        with opened as (source, known, settings):
+            known["settings"] = known.get("settings", {}) | settings._asdict()
+            truth = ContactTruthCollector(source.bus)
+            with output.recorded(source, known):
+                characterisation = Characterisation(source, on_host=output.follow, settings=settings)
+                run = characterisation.run(output.progress, check=check)
+        INTERRUPTION.check()  # one that was kept until now
+    except (MicrodriversError, KeyboardInterrupt) as error:
+        if characterisation is None:
+            raise
+        interrupted = characterisation.interrupted or isinstance(error, KeyboardInterrupt)
+        if run is None or not interrupted:
+            _tell_what_is_left(characterisation, error, known, truth, output)
+            if interrupted or source.whereabouts not in str(error):
+                click.echo(source.whereabouts, nl=bool(source.whereabouts), err=True)
+            if interrupted:
                 raise KeyboardInterrupt from error
             raise
-    result = _result(run, known, truth, output)
-    files = _measured(characterisation) | _files(result, output)
-    status = output.finish(result, partial(force_summary, result), files, complete=not characterisation.interrupted)
+        characterisation.interrupted = True
+    try:
+        status = _finish(characterisation, run, known, truth, output)
+    except KeyboardInterrupt:
+        click.echo(source.whereabouts, nl=bool(source.whereabouts), err=True)
+        raise
     if characterisation.interrupted:
         click.echo(f"interrupted; {source.whereabouts or 'the result is from what had been published'}", err=True)
     return status
 
 
-def _tell_what_is_left(
+def _finish(
     characterisation: Characterisation,
+    run: ForceRun,
     known: dict[str, Any],
     truth: ContactTruthCollector,
-    found: ForceRun | None,
+    output: RunOutput,
+) -> int:
+    """Write and show the result."""
+    measured = _measured(characterisation)
+    if characterisation.interrupted and write_results(output.folder, measured):  # before another Ctrl-C comes
+        click.echo(_what_to_do_with(output.folder / RECORD, ""), err=True)
+    from microdrivers.report.force_summary import force_summary
+
+    result = _result(run, known, truth, output)
+    files = measured | _files(result, output)
+    return output.finish(result, partial(force_summary, result), files, complete=not characterisation.interrupted)
+
+
+def _tell_what_is_left(
+    characterisation: Characterisation,
+    error: MicrodriversError | KeyboardInterrupt,
+    known: dict[str, Any],
+    truth: ContactTruthCollector,
     output: RunOutput,
 ) -> None:
     """Keep what an experiment that failed has measured, and what that says of the specimen."""
-    folder, measured = output.folder, _measured(characterisation)
+    folder, found = output.folder, characterisation.partial(error)
+    measured = _measured(characterisation)
+    recorded = f"{folder / RECORDING} holds the samples until then" if (folder / RECORDING).exists() else ""
     if not measured and characterisation.interrupted:
-        kept = f"; {folder / RECORDING} holds the samples until then" if (folder / RECORDING).exists() else ""
-        click.echo(f"interrupted before the specimen was pressed: there is no result{kept}", err=True)
+        what = "interrupted before the specimen was pressed: there is no result"
+        click.echo(f"{what}{'; ' * bool(recorded)}{recorded}", err=True)
+    elif measured and recorded:
+        command = shlex.join(["microdrivers", "calibrate", "force", "--replay", str(folder / RECORDING)])
+        click.echo(f"{recorded}; to analyse it: {command}", err=True)
     if measured and known["clock"] != "recorded" and write_results(folder, measured):
         click.echo(_what_to_do_with(folder / RECORD, characterisation.tells_nothing), err=True)
     if found is not None and write_results(folder, _files(_result(found, known, truth, output), output)):

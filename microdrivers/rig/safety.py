@@ -18,7 +18,7 @@ from microdrivers.devices.base import Device
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.motion_plan import MotionPlan
 from microdrivers.devices.stage import Stage
-from microdrivers.rig.safety_force_guard import ForceGuard, refuse_while_tripped
+from microdrivers.rig.safety_force_guard import BY, LIMIT_REMEDY, ForceGuard
 from microdrivers.rig.safety_keep_out import KeepOut
 from microdrivers.rig.safety_section import SafetySection
 
@@ -102,7 +102,7 @@ class Safety:
             UnsafeError: a tool presses too hard, the way leads into a keep-out box, or no forces come.
         """
         try:
-            refuse_while_tripped(tuple(self.guards.values()), plan)
+            self._refuse_while_tripped(plan)
             if isinstance(stage, FineStage):
                 self.keep_out.check(stage, plan)
             for guard in self._guards_of(stage.name):
@@ -156,6 +156,12 @@ class Safety:
             guard.close()
 
     # ------------------------------------------------------------------ inside
+
+    def _refuse_while_tripped(self, plan: MotionPlan) -> None:
+        """Let only retractions pass while a tool presses too hard: any stage may be what presses."""
+        for guard in self.guards.values():
+            if guard.tripped and plan.kind != "retraction":
+                raise UnsafeError(f"refused by the {BY}: {guard.tripped}", remedy=LIMIT_REMEDY)
 
     def _guards_of(self, stage: str) -> list[ForceGuard]:
         return [guard for guard in self.guards.values() if guard.settings.stage == stage]

@@ -17,6 +17,9 @@ from microdrivers.rig.sections import DeviceEntry, RigFile
 from microdrivers.rig.yaml_file import Document, Location
 
 _LEAST_PERIODS = 2.0
+_ASIDE = 0.1
+"""Share of a way: less than this of it along a direction, and it is at right angles to that."""
+
 _SECTION = "safety"
 
 
@@ -83,6 +86,7 @@ def _check_guard(
             f"{guard.sensor}",
         )
     yield from _check_figures(guard, devices[guard.sensor].settings, document, where)
+    yield from _check_way_out(guard, devices, document)
     stage = devices[guard.stage].settings
     largest_um_s = stage.largest_speed_um_s if isinstance(stage, ToolCarrierSettings) else math.inf
     if guard.max_speed_um_s is not None and guard.max_speed_um_s > largest_um_s:
@@ -97,6 +101,27 @@ def _check_guard(
             f"{guard.stage} has no way to take the tool away from what it presses on", ("devices", guard.stage),
             remedy="state retract_um: [x, y, z] of this stage in its own axes, the way that leads away from the sample",
         )  # fmt: skip
+
+
+def _check_way_out(
+    guard: ForceGuardSettings, devices: Mapping[str, DeviceEntry], document: Document
+) -> Iterator[ConfigError]:
+    """A tool that only goes aside goes on pressing; one that rises or goes back leaves what it presses on."""
+    stage, sensor = devices[guard.stage].settings, devices[guard.sensor].settings
+    if not isinstance(stage, ToolCarrierSettings) or not isinstance(sensor, ForceSensorSettings):
+        return  # drivers with settings of their own kind
+    if stage.retract_um is None:
+        return
+    way_out = stage.in_rig(stage.retract_um)
+    back_um = sum(a * b for a, b in zip(way_out, sensor.axis, strict=True))
+    if max(abs(back_um), abs(way_out[2])) < _ASIDE * math.hypot(*way_out):
+        yield document.error(
+            f"this way leads aside, at right angles to the axis of {guard.sensor} in the rig's frame, "
+            f"[{', '.join(f'{each:g}' for each in sensor.axis)}]: the tool goes on pressing",
+            ("devices", guard.stage, "retract_um"),
+            remedy=f"let it lead back along that axis, or up; or correct the axis of {guard.sensor}: the one along "
+            "which a push on the tip reads positive",
+        )
 
 
 def _check_figures(

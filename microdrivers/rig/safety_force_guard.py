@@ -17,7 +17,7 @@ from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, STALE
 from microdrivers.devices.motion_plan import MotionPlan
 from microdrivers.devices.stage import Stage
 from microdrivers.rig.safety_force_flow import ForceFlow
-from microdrivers.rig.safety_retraction import Retraction
+from microdrivers.rig.safety_retraction import Retraction, what_is_left
 from microdrivers.rig.safety_section import ForceGuardSettings
 
 BY = "force guard"
@@ -35,9 +35,10 @@ _WORSE_SHARE = 0.1
 """Of the limit: a retraction that adds as much leads the wrong way, or tears at something."""
 
 _AGAIN_NS = 20 * NS_PER_MS
-_LIMIT_REMEDY = (
+LIMIT_REMEDY = (
     "look at what the tool touches; only stop() and retract() pass until the force is back below the limit and the "
-    "tool has been taken away"
+    "tool has been taken away. If it touches nothing, it is the sensor's zero: tare, and state zero_within_uN, how far "
+    "the zero may be off, in the rig file's safety section"
 )
 _DATA_REMEDY = "check the force sensor, its cable and its amplifier; stop() and retract() work all the same"
 
@@ -91,6 +92,8 @@ class ForceGuard:
         self._braking_until_ns = -1
         self._least_uN = math.inf
         self._doubted_tare_uN = 0.0
+        self._newest: ForceSample | None = None
+        self._left_alone = False
 
     # ------------------------------------------------------------------ what the rig asks
 
@@ -172,7 +175,7 @@ class ForceGuard:
         """Judge a reading, and stop at once if it demands that; in the publisher's thread."""
         if STALE in sample.flags:
             return  # it is no reading: the age of the last one decides
-        force_uN = self._judged_uN(sample)
+        self._newest, force_uN = sample, self._judged_uN(sample)
         if abs(sample.tare_uN) > self.settings.zero_uN and sample.tare_uN != self._doubted_tare_uN:
             self._doubt_tare(sample.tare_uN)
         self._flow.take(sample)
@@ -182,6 +185,8 @@ class ForceGuard:
             self._hold_over_limit(force_uN, sample)
         elif self.tripped and abs(force_uN) <= _BELOW_SHARE * self.settings.max_force_uN:
             self._end_trip()
+        elif self._left_alone:
+            self._watch_what_follows(force_uN)
 
     def _judged_uN(self, sample: ForceSample) -> float:
         """The force that counts; infinite if it is beyond the sensor's range, NaN if it is not known."""
@@ -213,10 +218,10 @@ class ForceGuard:
             self._trip(reason, force_uN, retract=self._armed and stage is not None)
         else:
             moving = [each for each in self._stages_to_stop() if each.may_be_moving or self._unstopped]
-            self._stop_again(moving, reason, _LIMIT_REMEDY)
+            self._stop_again(moving, reason, LIMIT_REMEDY)
 
     def _trip(self, reason: str, force_uN: float, *, retract: bool) -> None:
-        failures = self._stop(self._stages_to_stop(), reason, _LIMIT_REMEDY)
+        failures = self._stop(self._stages_to_stop(), reason, LIMIT_REMEDY)
         if retract:
             self._retraction.begin()
         what = f"{reason}; {'stopped, and the tool is taken away' if retract else 'stopped'}"
@@ -255,8 +260,28 @@ class ForceGuard:
                 self.tripped = ""
 
     def _retraction_ended(self, what: str, succeeded: bool) -> None:
-        remedy = "" if succeeded else "; the tool may still press: retract() it, or free it by hand"
-        self._told(RETRACTION_RULE, f"{what}{remedy}", failed=not succeeded)
+        left, presses, self._left_alone = "", not succeeded, self._retraction.took_away
+        if self._left_alone:
+            force_uN = math.nan if self._newest is None or self._flow.complaint else self._judged_uN(self._newest)
+            left, presses = self._left(force_uN)
+        self._tell_left(f"{what}{left}", presses=presses)
+
+    def _left(self, force_uN: float) -> tuple[str, bool]:
+        return what_is_left(self.settings, force_uN, tared=self._newest is not None and self._newest.tare_uN != 0.0)
+
+    def _watch_what_follows(self, force_uN: float) -> None:
+        """A specimen that gives slowly comes after a tool that was taken away by too little."""
+        if not self._retraction.took_away:
+            self._left_alone = False
+            return
+        left, presses = self._left(force_uN)
+        if presses:
+            self._tell_left(f"what it was taken away from has come after the tool{left}", presses=True)
+
+    def _tell_left(self, what: str, *, presses: bool) -> None:
+        self._left_alone = self._left_alone and not presses
+        remedy = "; the tool may still press: retract() it, or free it by hand" if presses else ""
+        self._told(RETRACTION_RULE, f"{what}{remedy}", failed=presses)
 
     def _excess(self, force_uN: float) -> str:
         name, limit_uN = self.settings.sensor, self.settings.max_force_uN
@@ -337,14 +362,3 @@ class ForceGuard:
             raise error
 
         self._clock.call_at(self._clock.now_ns(), raise_it, name=BY)
-
-
-def refuse_while_tripped(guards: Sequence[ForceGuard], plan: MotionPlan) -> None:
-    """Let only retractions pass while a tool presses too hard: any stage may be what presses.
-
-    Raises:
-        UnsafeError: one does.
-    """
-    for guard in guards:
-        if guard.tripped and plan.kind != "retraction":
-            raise UnsafeError(f"refused by the {BY}: {guard.tripped}", remedy=_LIMIT_REMEDY)

@@ -60,6 +60,14 @@ class KeepOut:
                 "keep-out box",
                 remedy=f"make sure that the way is free, then reference({unknown!r})",
             )
+        self.check_way(stage, plan)
+
+    def check_way(self, stage: FineStage, plan: MotionPlan) -> None:
+        """As `check`, for a way whose start is known, whether or not the stage has been there.
+
+        Raises:
+            UnsafeError: the way leads into a box.
+        """
         start = stage.tip_um(plan.start)
         if plan.straight:
             self._check_begin(stage, plan)

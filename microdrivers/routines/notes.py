@@ -42,7 +42,7 @@ def noted_ending(bus: Bus, clock: Clock, kind: str, *, finish: Callable[[], obje
         bus: of the run.
         clock: of the run.
         kind: of the note.
-        finish: called before the note, however it ended; what it raises goes on, a second Ctrl-C too.
+        finish: called before the note, however it ended; what it raises is noted and goes on, a second Ctrl-C too.
     """
     ending = Ending()
     try:
@@ -54,5 +54,13 @@ def noted_ending(bus: Bus, clock: Clock, kind: str, *, finish: Callable[[], obje
         ending.ended_by = error.what
         raise
     finally:
-        finish()
-        note(bus, clock, kind, {"ended_by": ending.ended_by})
+        try:
+            finish()
+        except KeyboardInterrupt:
+            ending.ended_by = ending.ended_by or INTERRUPTED
+            raise
+        except MicrodriversError as error:
+            ending.ended_by = ending.ended_by or error.what
+            raise
+        finally:
+            note(bus, clock, kind, {"ended_by": ending.ended_by})

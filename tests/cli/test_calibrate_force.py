@@ -8,10 +8,11 @@ import pathlib
 import pytest
 import yaml
 
-from microdrivers.cli.calibrate_force import _run
+from microdrivers.cli.calibrate_force import _Opened, _run
 from microdrivers.cli.run_output import RunOutput
 from microdrivers.configs import shipped_rig
-from microdrivers.core.errors import MoveCancelled
+from microdrivers.core.clock.interruption import INTERRUPTION
+from microdrivers.core.errors import LinkLost, MoveCancelled
 from microdrivers.estimators.force.identify import IdentificationSettings
 from microdrivers.report import force_report
 from microdrivers.results.force import read_force_result
@@ -78,10 +79,14 @@ def test_a_figure_that_cannot_be_is_refused_before_anything_opens(run, tmp_path,
     assert not list(tmp_path.iterdir())
 
 
+def opened(source):
+    return contextlib.nullcontext(_Opened(source, dict(KNOWN), IdentificationSettings()))
+
+
 def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=600, error=MoveCancelled("the force guard has stopped it"))
     with pytest.raises(MoveCancelled):
-        _run(source, dict(KNOWN), True, IdentificationSettings(), RunOutput("force", tmp_path, as_json=True))
+        _run(opened(source), True, RunOutput("force", tmp_path, as_json=True))
     result = read_force_result(tmp_path / "result.json")
     assert not result.complete
     assert result.notes[-1] == (
@@ -98,7 +103,7 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     source = MadeUpSource(broken_off_at=60, error=KeyboardInterrupt())
     source.whereabouts = "probe_stage stands at x 10.0 µm; no contact was felt"
     with pytest.raises(KeyboardInterrupt):
-        _run(source, dict(KNOWN), True, IdentificationSettings(), RunOutput("force", tmp_path, as_json=True))
+        _run(opened(source), True, RunOutput("force", tmp_path, as_json=True))
     assert source.finished == 1
     assert len(measured(tmp_path)) == 60
     told = capsys.readouterr().err
@@ -106,6 +111,21 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     assert "to analyse it" not in told
     assert source.whereabouts in told
     assert not (tmp_path / "result.json").exists()
+
+
+@pytest.mark.parametrize("ended", [LinkLost("the port is gone"), KeyboardInterrupt()])
+def test_a_probe_that_is_not_taken_away_leaves_what_was_measured(tmp_path, capsys, ended):
+    def not_taken_away():
+        source.whereabouts = "the probe was not taken away and may be pressing"
+        raise ended
+
+    source = MadeUpSource()
+    source.finish = not_taken_away
+    with pytest.raises(type(ended)):
+        _run(opened(source), False, RunOutput("force", tmp_path, as_json=True))
+    assert not read_force_result(tmp_path / "result.json").complete
+    assert len(measured(tmp_path)) > 600
+    assert source.whereabouts in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -121,7 +141,7 @@ def test_an_interruption_before_the_press_says_that_there_is_no_result(tmp_path,
     monkeypatch.setattr(output, "recorded", lambda *_: contextlib.nullcontext())
     output.folder = tmp_path
     with pytest.raises(KeyboardInterrupt):
-        _run(source, dict(KNOWN), True, IdentificationSettings(), output)
+        _run(opened(source), True, output)
     told = capsys.readouterr().err
     assert "interrupted before the specimen was pressed: there is no result" in told
     assert (f"{tmp_path / 'run.mcap'} holds the samples until then" in told) is recorded
@@ -138,6 +158,21 @@ def test_an_interruption_of_the_report_names_what_is_there(run, tmp_path, monkey
     assert "choose another --out folder" in result.stderr
     read_force_result(tmp_path / "out" / "result.json")
     assert len(list((tmp_path / "out").iterdir())) == 3
+
+
+def test_an_interruption_that_is_kept_until_the_rig_is_closed_leaves_the_result_and_says_where_the_probe_is(
+    tmp_path, capsys
+):
+    @contextlib.contextmanager
+    def closing():
+        yield _Opened(source, dict(KNOWN), IdentificationSettings())
+        INTERRUPTION.requested = True
+
+    source = MadeUpSource()
+    source.whereabouts = "probe_stage stands at x 10.0 µm"
+    assert _run(closing(), False, RunOutput("force", tmp_path, as_json=True)) == 130
+    assert read_force_result(tmp_path / "result.json").complete
+    assert f"interrupted; {source.whereabouts}" in capsys.readouterr().err
 
 
 def _in_mN(rows):

@@ -8,6 +8,7 @@ from microdrivers.core.bus import Bus
 from microdrivers.core.contact_samples import ContactTruth, SpecimenTruth
 from microdrivers.core.units import NS_PER_S
 from microdrivers.fakes.world.mechanics import PRESETS
+from microdrivers.fakes.world.specimen import find_probe, nominal_surface_um
 from tests.fakes.specimen_bench import build, fine_stage, go, probe_rig, ready
 
 
@@ -25,6 +26,15 @@ def test_the_probe_meets_the_surface_where_it_should_be_and_feels_a_push_along_i
         assert world.force_uN("probe_force", t_ns) == pytest.approx(20 * 4.5161, rel=0.05)
         assert world.force_uN("gripper_force", t_ns) == 0.0
     assert len(set(places)) == 8
+
+
+def test_the_surface_lies_ahead_of_the_place_that_the_rig_file_states():
+    rig = probe_rig()
+    rig["probe"] = {"force": "probe_force", "ready_um": [100.0, -20.0, 10.0]}
+    probe = find_probe(rig)
+    assert nominal_surface_um(probe).tolist() == [7990.0, 7480.0, 10.0]
+    rig["devices"]["probe_stage"]["axes"]["x"]["travel_um"] = [-450.0, 625.0]
+    assert nominal_surface_um(find_probe(rig)).tolist() == [7990.0, 7480.0, 10.0]
 
 
 def test_a_tip_beside_or_above_passes():

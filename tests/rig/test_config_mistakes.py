@@ -226,6 +226,10 @@ MISTAKES = {
     "retraction downwards": (
         RETRACT, "retract_um: [0, 0, -400]", f"{PROBE}.retract_um", "down by 400 µm", "turn it round",
     ),
+    "retraction aside": (
+        RETRACT, "retract_um: [20, 300, 0]", f"{PROBE}.retract_um", "aside, at right angles to the axis of probe_force",
+        "back along that axis, or up",
+    ),
     "retraction into the specimen": (
         RETRACT, "retract_um: [-400, 0, 0]", f"{PROBE}.retract_um", "towards what the probe presses on",
         "axis of probe_force",

@@ -50,6 +50,26 @@ def test_a_press_without_a_guard_is_told(characterised):
     assert any(note.startswith("No force guard watched over the indentation") for note in unguarded.notes)
 
 
+def test_a_drift_of_the_picture_that_is_not_known_is_told(characterised):
+    _, run, result, _ = characterised
+    seen = run._replace(setup=run.setup._replace(camera="camera_fine"))
+    broken_off = seen._replace(first=seen.first._replace(drift=None, ended=False))
+    (note,) = set(result_of(broken_off).notes) - set(result_of(run).notes)
+    assert note.startswith("How far the picture drifted is not known, as the record ends before the probe was away")
+    assert note in force_report_html(result_of(broken_off))
+    assert "picture drifted" in force_summary(result_of(broken_off))
+    assert not any("picture drifted" in note for note in result.notes)
+
+
+def test_a_check_indentation_that_had_not_begun_is_told_as_such(characterised):
+    _, run, _, _ = characterised
+    began, not_begun = (
+        result_of(run._replace(check=run.first._replace(samples=[], forces=[], began=began))) for began in (True, False)
+    )
+    assert any("ended before the probe had pressed noticeably" in note for note in began.notes)
+    assert any("The check indentation had not begun" in note for note in not_begun.notes)
+
+
 def test_a_slip_that_is_not_identifiable_is_not_quoted(characterised):
     _, _, result, _ = characterised
     assert not result.slip.identifiable

@@ -10,6 +10,7 @@ import pytest
 from microdrivers.core.clock import SimulatedClock
 from microdrivers.core.errors import (
     DataError,
+    LinkLost,
     MicrodriversError,
     MoveCancelled,
     NoContact,
@@ -112,6 +113,38 @@ def test_an_interruption_of_the_press_keeps_what_was_measured_and_takes_the_prob
     assert AWAY_UM < before_um < AWAY_UM + 200
     assert len(characterisation.first.samples) > 30
     assert probe_um(rig) > -490.0 + AWAY_UM
+
+
+@pytest.mark.parametrize("ended", [LinkLost("the port is gone", remedy="plug it in"), KeyboardInterrupt()])
+def test_a_probe_that_cannot_be_taken_away_is_said_to_press_and_where(rig, monkeypatch, ended):
+    def fail():
+        raise ended
+
+    def fail_later():
+        monkeypatch.setattr(rig.devices["probe_stage"], "retract", fail)
+        monkeypatch.setattr(rig.devices["zoom"], "read", fail)
+        interrupt()
+
+    experiment = PressExperiment(rig, SHORT)
+    characterisation = Characterisation(experiment)
+    with pytest.raises(type(ended)) as caught:
+        characterisation.run(Steps("pressing at", lambda: later(rig, 1.0, fail_later)), check=False)
+    assert experiment.setup().zoom == pytest.approx(rig.devices["zoom"].topic.latest.zoom)
+    monkeypatch.undo()
+    saw = re.match(
+        r"the probe was not taken away and may be pressing: probe_stage was last seen at x (-\d+\.\d) µm, y .* µm, "
+        r"(\d+) µm beyond the contact, with (\d+\.?\d*) µN felt$",
+        experiment.whereabouts,
+    )
+    assert float(saw[1]) == pytest.approx(probe_um(rig), abs=1.0)
+    assert float(saw[3]) > 10.0
+    if isinstance(ended, LinkLost):
+        assert str(caught.value).startswith(f"{experiment.whereabouts}. the port is gone")
+        assert f"{rig.description.file} probe_stage --retract; or free it by hand. plug it in" in caught.value.remedy
+    assert characterisation.interrupted
+    assert not rig.devices["probe_stage"].read().moving
+    assert characterisation.first.samples
+    rig.devices["probe_stage"].retract().wait()
 
 
 def test_a_guard_that_trips_on_the_way_back_leaves_a_partial_result(rig):
@@ -320,6 +353,23 @@ def test_a_keep_out_box_on_the_way_is_told_before_anything_moves(rig, monkeypatc
     monkeypatch.setattr(rig.safety, "keep_out", KeepOut([box]))
     with pytest.raises(UnsafeError, match="too near to the keep-out box 'wall'"):
         PressExperiment(rig, SHORT)
+    monkeypatch.setattr(type(stage), "referenced", dict.fromkeys("xyz", False))
+    with pytest.raises(UnsafeError, match="too near to the keep-out box 'wall'"):
+        PressExperiment(rig, SHORT)
+
+
+def test_a_keep_out_box_behind_the_surface_is_told_before_the_press(rig):
+    stage = rig.devices["probe_stage"]
+    x, y, z = stage.tip_um({"x": -500.0, "y": 0.0, "z": 0.0})
+    box = KeepOutBox(name="wall", min_um=(x - 20.0, y - 50.0, z - 50.0), max_um=(x, y + 50.0, z + 50.0))
+    free, rig.safety.keep_out = rig.safety.keep_out, KeepOut([box])
+    try:
+        characterisation, error = run(rig, SHORT._replace(most_approach_um=100.0, depth_um=60.0))
+    finally:
+        rig.safety.keep_out = free
+    assert isinstance(error, UnsafeError)
+    assert "presses is not free: the tip would come too near to the keep-out box 'wall'" in error.what
+    assert characterisation.first is None
 
 
 def test_a_picture_in_which_nothing_moves_asks_for_tip_and_specimen(rig):

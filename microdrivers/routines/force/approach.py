@@ -17,6 +17,11 @@ from microdrivers.routines.progress import Progress
 _PROGRESS_UM = 1.0
 """Farther than the last false alarm must the next one be: a drift that is faster hides the specimen."""
 
+_APPROACH_GENTLY = (
+    "the limit was exceeded before the touch was recognised, or by the sensor's zero: approach more slowly "
+    "(--speed-um-s), check the sensor's zero, or allow more in the rig file's safety section (max_force_uN)"
+)
+
 _AWAY_S, _AWAY_READINGS = 0.15, 2
 """So long, and for so many readings, the force is looked at when the tool has gone back."""
 
@@ -112,7 +117,7 @@ def _touch_below(limit_uN: float, sensor: ForceSensor) -> Touch:
 
 
 def _until_felt(drive: ProbeDrive, sensor: ForceSensor, touch: Touch, end_um: float) -> float:
-    reached_um = drive.run(end_um, lambda: touch.enough)
+    reached_um = drive.run(end_um, lambda: touch.enough, below_limit=_APPROACH_GENTLY)
     touch.raise_if_saturated("on the approach", sensor=sensor.name)
     if not touch.enough:
         raise NoContact(

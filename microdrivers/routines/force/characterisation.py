@@ -34,7 +34,7 @@ from microdrivers.routines.force.source import (
     Rests,
     host_name,
 )
-from microdrivers.routines.notes import note, noted_ending
+from microdrivers.routines.notes import INTERRUPTED, note, noted_ending
 from microdrivers.routines.past_run import PastRun
 from microdrivers.routines.progress import Progress, SilentProgress
 
@@ -51,6 +51,7 @@ class Indentation(NamedTuple):
         deformations: one a frame. estimates: of the recursion. forces: read from the camera.
         arrivals: bus-wide order numbers in the order in which the estimators saw the samples. recorded: these samples,
             if asked for.
+        began: whether the tool had set out. ended: whether it had come back, and rested.
     """
 
     samples: list[IndentationSample]
@@ -63,6 +64,8 @@ class Indentation(NamedTuple):
     forces: list[VisionForceSample]
     arrivals: list[int]
     recorded: list[Sample]
+    began: bool
+    ended: bool
 
 
 class ForceRun(NamedTuple):
@@ -119,22 +122,27 @@ class Characterisation:
                 a specimen. MicrodriversError: whatever the source raises. See `partial` for what is left then.
         """
         note(self._source.bus, self._source.clock, SETTINGS, self._settings._asdict())
-        with noted_ending(self._source.bus, self._source.clock, DONE, finish=self._source.finish) as ending:
-            try:
-                self._experiment(progress or SilentProgress(), check=check)
-            except KeyboardInterrupt:
-                self.interrupted = True
-                raise
+        try:
+            with noted_ending(self._source.bus, self._source.clock, DONE, finish=self._source.finish) as ending:
+                try:
+                    self._experiment(progress or SilentProgress(), check=check)
+                except KeyboardInterrupt:
+                    self.interrupted = True
+                    raise
+        except KeyboardInterrupt:  # while the probe was taken away
+            self.interrupted = True
+            raise
         if self.first is None:
             raise NoContact("interrupted before anything was measured", remedy="start again")
         return self._found(ending.ended_by or self._source.past_run.ended_by)
 
-    def partial(self, error: MicrodriversError) -> ForceRun | None:
+    def partial(self, error: MicrodriversError | KeyboardInterrupt) -> ForceRun | None:
         """What had been measured before `run` ended with this error, identified; None if that tells nothing."""
+        ended_by = error.what if isinstance(error, MicrodriversError) else INTERRUPTED
         if self.first is None or not self.first.frames:
             return None
         try:
-            return self._found(error.what)
+            return self._found(ended_by)
         except NoContact:
             self.tells_nothing = f"no contact shows in its {len(self.first.frames)} frames"
         except (DataError, CalibrationError) as why:
@@ -275,6 +283,8 @@ class _Session:
             forces=[sample for sample in self._found if isinstance(sample, VisionForceSample)],
             arrivals=[] if self._host is None else self._host.inbox.arrivals,
             recorded=[] if self._host is None else self._host.recorded,
+            began=self._host is not None,
+            ended=rests is not None,
         )
 
     def _publish(self, sample: Sample) -> None:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from microdrivers.core.contact_samples import DeformationSample
-from microdrivers.core.errors import ConfigError, NotReferenced
+from microdrivers.core.errors import ConfigError, LinkError, MicrodriversError, NotReferenced
 from microdrivers.core.samples import Frame
 from microdrivers.devices.camera import Camera
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.force_sensor import TARE_DURATIONS_S, ForceSensor, Tare
 from microdrivers.rig import Rig
 from microdrivers.routines.force.approach import Contact, find_specimen, tare_s
-from microdrivers.routines.force.press_checks import check_press
+from microdrivers.routines.force.press_checks import check_press, require_free
 from microdrivers.routines.force.press_settings import PressSettings
 from microdrivers.routines.force.probe_drive import ProbeDrive
 from microdrivers.routines.force.sight import Sight, zoom_of
@@ -82,6 +82,7 @@ class PressExperiment:
         self._near = False
         self._indented = False
         self._watcher: FrameTracker | None = None
+        self._zoom: float | None = None
         self.whereabouts = ""
 
     # ------------------------------------------------------------------ before the indentation
@@ -110,6 +111,7 @@ class PressExperiment:
             clock=self.clock, progress=progress,
         )  # fmt: skip
         progress.step(f"contact after {contact.place_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
+        require_free(self._rig, self._stage, way, contact.place_um + self.settings.depth_um)
         self.clock.sleep(self.settings.rest_s)
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
         ahead_um = contact.place_um - drive.place_um
@@ -119,6 +121,7 @@ class PressExperiment:
             for _ in range(2)
         )
         self._tare()
+        self._zoom = zoom_of(self._rig)
         self._note_ready(travel, rest, ahead_um)
         return tracker
 
@@ -262,21 +265,55 @@ class PressExperiment:
     # ------------------------------------------------------------------ afterwards
 
     def finish(self) -> None:
-        """Stop, and take the probe away if it may touch something; a guard that does so already is let finish."""
+        """Stop, and take the probe away if it may touch something; a guard that does so already is let finish.
+
+        A further Ctrl-C leaves the probe where it then is. Then, as when it cannot be taken away, `whereabouts` tells
+        where it was last seen, and what was felt there.
+        """
+        try:
+            self._take_away()
+        except KeyboardInterrupt:
+            self.whereabouts = self._last_seen()
+            self._stage.stop(by="characterisation", reason="interrupted")
+            raise
+        except MicrodriversError as error:
+            if not self._near:
+                raise
+            self.whereabouts = self._last_seen()
+            error.what = f"{self.whereabouts}. {error.what}"
+            back = "once the connection is back: " if isinstance(error, LinkError) else ""
+            command = f"microdrivers move {self._rig.description.file} {self._stage.name} --retract"
+            error.remedy = f"{back}{command}; or free it by hand. {error.remedy}".strip()
+            raise
+
+    def _take_away(self) -> None:
         self._rig.safety.finish()
         self._stage.stop(by="characterisation", reason="the experiment ended")
-        if self._drive is None or self._stage.link != "open":
+        if self._drive is None or not (self._near or self._stage.link == "open"):
             return
         self._drive.rest()
         if self._near and not self._rig.safety.took_away(self._stage.name):
             self._drive.take_away()
             self._near = False
         position = self._stage.read().position
-        where = ", ".join(f"{axis} {um:.1f} µm" for axis, um in position.items())
-        contact = "no contact was felt"
-        if self._contact is not None:
-            contact = f"{self._contact.place_um - self._drive.way.place_um(position):.0f} µm before the contact"
-        self.whereabouts = f"{self._stage.name} stands at {where}; {contact}"
+        self.whereabouts = f"{self._stage.name} stands at {_written(position)}; {self._from_contact(position)}"
+
+    def _from_contact(self, position: Mapping[str, float]) -> str:
+        if self._contact is None or self._drive is None:
+            took_away = self._rig.safety.took_away(self._stage.name)
+            return "the force guard has taken it away" if took_away else "no contact was felt"
+        before_um = self._contact.place_um - self._drive.way.place_um(position)
+        return f"{abs(before_um):.0f} µm {'before' if before_um > 0.0 else 'beyond'} the contact"
+
+    def _last_seen(self) -> str:
+        """Where the newest samples say that the probe was, and what it felt, if it has been near the specimen."""
+        pose, force = self._stage.topic.latest, self._sensor.topic.latest
+        if not self._near:
+            return "" if pose is None else f"{self._stage.name} was last seen at {_written(pose.position)}"
+        at = "" if pose is None else f" at {_written(pose.position)}, {self._from_contact(pose.position)}"
+        felt = "" if force is None else f", with {force.force_uN:.4g} µN felt"
+        may = "" if at.endswith("before the contact") else " and may be pressing"
+        return f"the probe was not taken away{may}: {self._stage.name} was last seen{at}{felt}"
 
     def setup(self) -> IndentationSetup:
         """Names, speed, scale and zoom."""
@@ -284,12 +321,16 @@ class PressExperiment:
         return IndentationSetup(
             sensor=self._sensor.name, stage=self._stage.name, camera=self._camera.name,
             scale_source=self._sight.source, scale_px_per_um=self._sight.scale_px_per_um,
-            scale_sigma_px_per_um=self._sight.scale_sigma_px_per_um, zoom=zoom_of(self._rig),
+            scale_sigma_px_per_um=self._sight.scale_sigma_px_per_um, zoom=self._zoom,
             speed_um_s=self.settings.speed_um_s, tare_uN=None if tare is None else tare.offset_uN,
             guarded=self._guarded,
             touch_uN=None if self._contact is None else self._contact.touch_uN,
             touched_s=None if self._contact is None else self._contact.pressed_s,
         )  # fmt: skip
+
+
+def _written(position: Mapping[str, float]) -> str:
+    return ", ".join(f"{axis} {um:.1f} µm" for axis, um in position.items())
 
 
 class _Travel(NamedTuple):

@@ -20,7 +20,7 @@ def check_press(
     """Refuse what stage, force guard or keep-out boxes forbid, as far as it is known; nothing moves.
 
     Args:
-        rig: with the guard and the boxes; these are asked once all axes have their reference.
+        rig: with the guard and the boxes.
         stage: carries the sensor.
         sensor: presses.
         settings: of the experiment.
@@ -51,13 +51,21 @@ def check_press(
             device=stage.name,
             remedy="choose a place nearer to the middle of the travel (ready_um in the rig file), or press less deeply",
         )
-    if all(stage.referenced.values()):
-        try:
-            for plan in way.plans(-settings.free_travel_um, approach_um):
-                rig.safety.keep_out.check(stage, plan)
-        except UnsafeError as error:
-            raise UnsafeError(
-                f"the way on which the probe looks for the specimen is not free: {error.what}",
-                device=stage.name,
-                remedy="correct ready_um or the box in the rig file, or bring the probe to another place",
-            ) from error
+    require_free(rig, stage, way, -settings.free_travel_um, max(approach_um, settings.depth_um))
+
+
+def require_free(rig: Rig, stage: FineStage, way: ProbingWay, *places_um: float) -> None:
+    """Refuse a way, from its start to the first place and on to the others, that a keep-out box blocks.
+
+    Raises:
+        UnsafeError: one does.
+    """
+    try:
+        for plan in way.plans(*places_um):
+            rig.safety.keep_out.check_way(stage, plan)
+    except UnsafeError as error:
+        raise UnsafeError(
+            f"the way on which the probe looks for the specimen and presses is not free: {error.what}",
+            device=stage.name,
+            remedy="correct ready_um or the box in the rig file, use another place, or press less deeply",
+        ) from error

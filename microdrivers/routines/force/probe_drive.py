@@ -21,6 +21,8 @@ _LOOK_S = 0.05
 _PATIENCE = 10
 """Looks after which a stage that still moves is told to stop again."""
 
+_PRESS_LESS = "press more slowly, or turn back farther below the limit: --max-force-uN"
+
 _FIRST_READING_S = 0.5
 """How long a sensor's stream may take to begin."""
 
@@ -78,15 +80,26 @@ class ProbeDrive:
             yield
 
     def run(
-        self, place_um: float, enough: Callable[[], bool], show: Callable[[float], None] = lambda _um: None
+        self,
+        place_um: float,
+        enough: Callable[[], bool],
+        show: Callable[[float], None] = lambda _um: None,
+        *,
+        below_limit: str = _PRESS_LESS,
     ) -> float:
         """Move at the experiment's speed until the place, or until enough; returns where the tip then is.
+
+        Args:
+            place_um: on the way.
+            enough: asked with each reading and pose.
+            show: told where the tip is.
+            below_limit: what to do if the force guard intervenes.
 
         Raises:
             DataError: no valid force comes; the stage was stopped, or has not moved.
             MoveCancelled: the force guard, or somebody else, stopped the stage.
         """
-        self._require_calm()
+        self._require_calm(below_limit)
         self._require_forces(self._data.complaint)
         if enough():
             return self.place_um
@@ -109,7 +122,7 @@ class ProbeDrive:
             except MoveCancelled as cancelled:
                 if not stopped_for:
                     raise
-                self._require_calm(cancelled)
+                self._require_calm(below_limit, cancelled)
                 self.rest()
         self._require_forces("".join(stopped_for[:1]))
         return self.place_um
@@ -147,13 +160,13 @@ class ProbeDrive:
         taken = "the tool was taken away" if safety.took_away(self._stage.name) else ""
         return "; ".join(safety.tripped.values()) or taken
 
-    def _require_calm(self, cancelled: MoveCancelled | None = None) -> None:
+    def _require_calm(self, remedy: str, cancelled: MoveCancelled | None = None) -> None:
         """Raise if a guard has intervened, possibly while the stage still braked."""
         if intervened := self._intervened:
             raise MoveCancelled(
                 f"the force guard intervened: {intervened}",
                 device=self._stage.name,
-                remedy="press more slowly, or turn back farther below the limit: --max-force-uN",
+                remedy=remedy,
             ) from cancelled
 
     def _require_forces(self, complaint: str) -> None:

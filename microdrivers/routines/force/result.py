@@ -311,6 +311,11 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
             f"The camera shows the surface {abs(ahead_um):.3g} µm {'beyond' if ahead_um > 0.0 else 'before'} where the "
             "approach felt a contact: the specimen was pressed less or more deeply than asked for by as much."
         )
+    if run.setup.camera is not None and run.first.drift is None and not run.first.ended:
+        notes.append(
+            "How far the picture drifted is not known, as the record ends before the probe was away again: it was not "
+            "taken off, and the intervals do not contain it."
+        )
     if not run.setup.guarded:
         notes.append("No force guard watched over the indentation: the rig file's safety section states none.")
     if not run.complete:
@@ -325,9 +330,10 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
             "the model was identified."
         )
     if check is None and run.check is not None:
+        began = run.check.began
         notes.append(
-            "The check indentation ended before the probe had pressed noticeably; camera-based force could not be "
-            "assessed."
+            f"The check indentation {'ended before the probe had pressed noticeably' if began else 'had not begun'}; "
+            "camera-based force could not be assessed."
         )
     if check is not None and check.left_over_uN is not None:
         notes.append(
