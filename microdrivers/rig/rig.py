@@ -125,13 +125,16 @@ class Rig:
     def close(self) -> None:
         """Stop everything, then close everything; whatever fails is logged and does not keep the rest from it.
 
-        A tool that the force guard is taking away gets there first, except after Ctrl-C.
+        A tool that the force guard is taking away gets there first, except after Ctrl-C. One that comes meanwhile takes
+        effect when all is closed; a second one at once.
         """
         try:
             if not isinstance(sys.exception(), KeyboardInterrupt):
                 self.safety.finish()
         finally:
-            self._stop_and_close()
+            with INTERRUPTION.held():
+                self._stop_and_close()
+        INTERRUPTION.check()
 
     def _stop_and_close(self) -> None:
         self.safety.disarm()
@@ -156,8 +159,10 @@ class Rig:
         try:
             self.open()
         except BaseException:
-            INTERRUPTION.rig_closed()
-            self.close()
+            try:
+                self.close()
+            finally:
+                INTERRUPTION.rig_closed()
             raise
         return self
 

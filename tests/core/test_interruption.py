@@ -1,11 +1,15 @@
 """Ctrl-C at clean moments: kept while a rig is open, let through where the main program waits."""
 
+from contextlib import ExitStack
+
 import pytest
 
+from microdrivers.configs import shipped_rig
 from microdrivers.core.clock import SimulatedClock, SystemClock
 from microdrivers.core.clock import simulated as simulated_module
 from microdrivers.core.clock import system as system_module
-from microdrivers.core.clock.interruption import Interruption
+from microdrivers.core.clock.interruption import INTERRUPTION, Interruption
+from microdrivers.rig import open_rig
 
 
 @pytest.fixture
@@ -65,3 +69,34 @@ def test_one_that_came_too_late_for_a_rig_does_not_meet_the_next(interruption):
     interruption.rig_closed()
     interruption.rig_opened()
     SimulatedClock().sleep(0.001)
+
+
+def test_while_it_is_held_waiting_goes_on_and_a_second_one_does_not_wait(interruption):
+    interruption.rig_opened()
+    clock = SimulatedClock()
+    with interruption.held():
+        interruption.request()
+        clock.sleep(0.01)
+        with interruption.waiting():
+            assert interruption.requested
+    with pytest.raises(KeyboardInterrupt):
+        interruption.check()
+    interruption.check()  # once
+    with interruption.held(), pytest.raises(KeyboardInterrupt):
+        interruption.request()
+
+
+def test_an_interruption_while_a_rig_is_closed_keeps_no_device_open(monkeypatch):
+    stack = ExitStack()
+    rig = stack.enter_context(open_rig(shipped_rig(), fake=True, clock=SimulatedClock()))
+    first, *others = rig.devices.values()
+    close = first.close
+
+    def closing():
+        INTERRUPTION.request()
+        close()
+
+    monkeypatch.setattr(first, "close", closing)
+    with pytest.raises(KeyboardInterrupt):
+        stack.close()
+    assert [device.link for device in (first, *others)] == ["closed"] * len(rig.devices)

@@ -19,7 +19,7 @@ class Interruption:
 
     def __init__(self) -> None:
         self._rigs_open = 0
-        self._waiting = False
+        self._waiting = self._held = False
         self.requested = False
         self._signals = 0
 
@@ -30,16 +30,26 @@ class Interruption:
             KeyboardInterrupt: nothing is open, the main program is waiting, or it was asked before.
         """
         self._signals += 1
-        if self._rigs_open == 0 or self._waiting or self._signals > 1:
-            self.requested = False
-            raise KeyboardInterrupt
-        self.requested = True
+        if self._signals == 1 and (self._held or (self._rigs_open > 0 and not self._waiting)):
+            self.requested = True
+            return
+        self.requested = False
+        raise KeyboardInterrupt
 
     def check(self) -> None:
         """Let a kept interruption happen; called where nothing is half done."""
-        if self.requested:
+        if self.requested and not self._held:
             self.requested = False
             raise KeyboardInterrupt
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """What is done must be done whole, waiting included: a first interruption is kept until afterwards."""
+        self._held = True
+        try:
+            yield
+        finally:
+            self._held = False
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
