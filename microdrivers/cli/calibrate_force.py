@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from microdrivers.cli.options import fields_given, refuse_options_given
+from microdrivers.cli.options import fields_given, given, refuse_options_given
 from microdrivers.cli.output import describe_recorded, describe_rig, tell_flaws, write_results
 from microdrivers.cli.rig_options import WIRE_LOG_HELP, RigChoice, saying_commands
 from microdrivers.cli.run_output import RECORDING, RESULT, RecordingChoice, RunOutput, recording_options
@@ -117,7 +117,7 @@ def force(
         if table is not None:
             opened, check = _from_table(table, specimen, settings), False
         elif replay is not None:
-            opened = _from_recording(replay, settings)
+            opened = _from_recording(replay, settings, must_check=check and given("check"))
         else:
             _check_figures(press)
             emulated = fake or rig_file is None
@@ -170,13 +170,19 @@ class _Opened(NamedTuple):
 
 
 @contextlib.contextmanager
-def _from_recording(file: Path, settings: IdentificationSettings) -> Iterator[_Opened]:
+def _from_recording(file: Path, settings: IdentificationSettings, *, must_check: bool) -> Iterator[_Opened]:
+    from microdrivers.core.errors import UnsupportedError
     from microdrivers.recording.reader import Recording
     from microdrivers.routines.force import IndentationReplay
 
     with Recording(file) as recording:
         tell_flaws(recording)
         source = IndentationReplay(recording)
+        if must_check and not source.repeatable:
+            raise UnsupportedError(
+                f"{file} holds one indentation: there is no other to check the camera's force with",
+                remedy="leave out --check",
+            )
         if source.past_settings is not None:
             settings = source.past_settings._replace(**fields_given(settings, _SETTINGS))
         yield _Opened(source, describe_recorded(recording), settings)

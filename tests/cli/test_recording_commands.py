@@ -342,6 +342,11 @@ def test_a_folder_is_no_file_and_a_cluster_has_its_own_workers(run, run_file):
     assert "--jobs and --dask exclude each other" in result.stderr
 
 
+def test_a_check_that_was_not_recorded_cannot_be_asked_for(run, force_recording):
+    result = run("calibrate", "force", "--replay", force_recording, "--check")
+    assert (result.exit_code, "holds one indentation" in result.stderr) == (1, True)
+
+
 def rewrite(source, file, change=lambda sample: [sample]):
     """A copy in chunks of few samples, each sample replaced by what `change` makes of it."""
     bus, clock = Bus(), SimulatedClock()
