@@ -97,8 +97,9 @@ class Sight:
             if error.reason == "nothing_moved":
                 error.what = f"nothing in the picture moved while the probe travelled {np.ptp(travel_um):.0f} µm"
                 error.remedy = (
-                    "see that the probe's tip, and the specimen before it, are in view, in focus and lit; an emulated "
-                    "rig shows neither without a specimen (--specimen)"
+                    "see that the probe's tip, and the specimen before it, are in view, in focus and lit, and that the "
+                    "sensor's axis in the rig file is the one along which it is pushed; an emulated rig shows neither "
+                    "without a specimen (--specimen)"
                 )
             raise
         if self._projection is not None:
