@@ -58,10 +58,11 @@ def describe(recording: Recording) -> dict[str, Any]:
         topics[name] = {
             "sample_type": topic.sample_type.__name__,
             "count": topic.count,
-            "rate_hz": topic.rate_hz if math.isfinite(topic.rate_hz) else None,
+            "rate_hz": _finite(topic.rate_hz),
+            "usual_rate_hz": _finite(topic.usual_rate_hz),
             "first_s": (topic.first_t_ns - begin_ns) / NS_PER_S if topic.count else None,
             "last_s": (topic.last_t_ns - begin_ns) / NS_PER_S if topic.count else None,
-            "longest_gap_s": topic.longest_gap_s if math.isfinite(topic.longest_gap_s) else None,
+            "longest_gap_s": _finite(topic.longest_gap_s),
             "missing": topic.gaps,
             "dropped": topic.dropped,
             "repeated": topic.repeated,
@@ -85,6 +86,10 @@ def describe(recording: Recording) -> dict[str, Any]:
     }
 
 
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _as_text(found: dict[str, Any]) -> str:
     header = found["header"]
     ended = "complete" if found["complete"] else "NOT COMPLETE: see what it has lost, below"
@@ -100,7 +105,7 @@ def _as_text(found: dict[str, Any]) -> str:
         f"  clock      {_clock(found['clock'])}",
         "",
     ]
-    names = ["topic", "samples", "count", "rate", "from s", "to s", "longest gap s", *_COUNTS]
+    names = ["topic", "samples", "count", "mean rate", "from s", "to s", "longest gap s", *_COUNTS]
     rows = [names, *(_row(name, topic) for name, topic in found["topics"].items())]
     widths = [max(len(row[column]) for row in rows) for column in range(len(names))]
     for row in rows:

@@ -57,7 +57,7 @@ def write_contact_sheet(recording: Recording, file: Path, *, frames: int = 12, c
             if index in wanted and isinstance(frame, Frame)
         ]
         shown += len(thumbnails)
-        blocks.append(_block(f"{name}: {found.count} frames, {found.rate_hz:.3g} Hz", thumbnails, columns))
+        blocks.append(_block(f"{name}: {found.count} frames, {found.usual_rate_hz:.3g} Hz", thumbnails, columns))
     done, data = cv2.imencode(".png", np.vstack(blocks))
     if not done:
         raise UnsupportedError(f"{shown} frames could not be made one image", remedy="leave out --contact-sheet")

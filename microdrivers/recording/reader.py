@@ -79,11 +79,15 @@ class Recording:
         Each call reads the file anew. What cannot be read is left out, and is told by `losses`.
 
         Raises:
-            ConfigError: `topics` is a text rather than several; or, at the end, one of them that is no pattern is
+            ConfigError: `topics` or `leave_out` is one text; or, at the end, one of `topics` that is no pattern is
                 `required` and not in the recording.
         """
-        if isinstance(topics, str):
-            raise ConfigError(f"topics must be several, not the text {topics!r}", remedy=f"give [{topics!r}]")
+        for names in (topics, leave_out):
+            if isinstance(names, str):
+                raise ConfigError(
+                    f"names of topics must be several, not one text, {names!r}", remedy=f"give [{names!r}]"
+                )
+        topics, leave_out = None if topics is None else tuple(topics), tuple(leave_out)
         seen: set[str] = set()
 
         def take(reader: ChannelReader) -> Action[Sample]:

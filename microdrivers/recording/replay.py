@@ -57,8 +57,8 @@ class Replay:
     Attributes:
         published: number of samples so far. missing: samples that an inbox got and the recording does not hold.
 
-    A sample that the file holds twice is published once. Where it holds one farther from its place than threads can
-    overtake each other, whatever reaches that place raises `DataError`.
+    A sample that the file holds twice in a row, or nearly so, is published once. Where it holds one farther from its
+    place than threads can overtake each other, whatever reaches that place raises `DataError`.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Replay:
         self._source: Iterator[tuple[str, Sample]] = recording.samples(leave_out=leave_out)
         self._waiting: deque[tuple[str, Sample]] = deque()
         self._frames_waiting = 0
-        self._taken = -1
+        self._newest = self._taken = -1
         self._topics: dict[str, Topic[Any]] = {}
         self._recording = recording
         self._clock = clock
@@ -143,12 +143,11 @@ class Replay:
         """Read ahead; tells whether anything is left."""
         waiting = self._waiting
         if self._frames_waiting < _FRAMES_AHEAD:
-            newest = waiting[-1][1].order if waiting else self._taken
             for entry in self._source:
                 order = entry[1].order
-                if order > newest or order < 0:
+                if order > self._newest or order < 0:
                     waiting.append(entry)
-                    newest = order
+                    self._newest = max(order, self._newest)
                 elif not self._insert(entry):
                     continue
                 self._frames_waiting += isinstance(entry[1], Frame)
@@ -172,15 +171,15 @@ class Replay:
         if order < before:
             raise DataError(
                 f"{self._recording.file} does not hold its samples in the order in which they were published: one of "
-                f"{entry[0]!r} stands far behind its place",
-                remedy="another program has rewritten the file: have it sort the messages by their log time",
+                f"{entry[0]!r} stands, perhaps once more, far behind its place",
+                remedy="another program has rewritten the file: have it sort the messages by their log time, each once",
             )
         waiting.insert(place, entry)
         return True
 
     def _take_next(self) -> tuple[str, Sample]:
         entry = self._waiting.popleft()
-        self._taken = entry[1].order
+        self._taken = max(entry[1].order, self._taken)
         if isinstance(entry[1], Frame):
             self._frames_waiting -= 1
         if len(self._waiting) < _READ_AHEAD:

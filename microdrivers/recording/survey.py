@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from microdrivers.core.samples import Frame, Sample, WireTraffic
 from microdrivers.core.units import NS_PER_S
@@ -22,8 +24,9 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
         sample_type: of its samples.
         count: how many samples can be read.
         first_t_ns, last_t_ns: earliest and latest instant, ns on the rig's clock; 0 if there are none.
-        rate_hz: that of the median interval from one instant to the next, so that pauses do not count; of a long
-            recording, of a few thousand intervals, evenly spread. NaN if no sample is later than those before it.
+        rate_hz: mean rate between these; NaN with fewer than two different instants.
+        usual_rate_hz: that of the median interval from one instant to the next, so that pauses do not count; of a long
+            recording, of a few thousand intervals, evenly spread. NaN as above.
         longest_gap_s: longest time from one instant to the next; NaN as above.
         gaps: how many `seq` numbers are missing between the lowest and the highest.
         repeated: how many stand in the file once more, by their `order`.
@@ -37,6 +40,7 @@ class TopicSummary(msgspec.Struct, frozen=True, kw_only=True):
     first_t_ns: int
     last_t_ns: int
     rate_hz: float
+    usual_rate_hz: float
     longest_gap_s: float
     gaps: int
     repeated: int
@@ -151,11 +155,21 @@ class _Count:
 
     def summary(self, dropped: int) -> TopicSummary:
         has_times = bool(self.intervals_ns)
-        repeated = self.count - len(np.unique(self.orders))
+        span_ns, usual_ns = self.last_ns - self.first_ns, np.median(self.intervals_ns) if has_times else math.nan
+        repeated = _repeated(np.asarray(self.orders, dtype=np.int64))
         return TopicSummary(
             sample_type=self.sample_type, count=self.count, first_t_ns=self.first_ns, last_t_ns=self.last_ns,
-            rate_hz=NS_PER_S / float(np.median(self.intervals_ns)) if has_times else float("nan"),
-            longest_gap_s=self.longest_ns / NS_PER_S if has_times else float("nan"),
+            rate_hz=(self.count - 1) * NS_PER_S / span_ns if has_times else math.nan,
+            usual_rate_hz=NS_PER_S / float(usual_ns),
+            longest_gap_s=self.longest_ns / NS_PER_S if has_times else math.nan,
             gaps=max(0, self.last_seq - self.first_seq + 1 - self.count + repeated), repeated=repeated,
             unsorted=0 if self.sample_type is WireTraffic else self.unsorted, dropped=dropped,
         )  # fmt: skip
+
+
+def _repeated(orders: npt.NDArray[np.int64]) -> int:
+    """How many of these numbers stand there once more; those below 0 were never given."""
+    if np.all(orders[1:] > orders[:-1]):
+        return 0
+    given = orders[orders >= 0]
+    return len(given) - len(np.unique(given))

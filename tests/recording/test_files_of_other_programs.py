@@ -128,6 +128,9 @@ def test_names_that_no_topic_has_are_refused_and_patterns_may_match_none(recorde
         for wrong in ("force", ["nowhere"], ["force", "nowhere"]):
             with pytest.raises(ConfigError):
                 list(recording.samples(wrong))
+        with pytest.raises(ConfigError, match="not one text"):
+            recording.samples(leave_out="force")
+        assert len(list(recording.samples(name for name in ("force", "camera")))) == 510
         assert list(recording.samples(["nowhere*"])) == []
         assert list(recording.samples(["nowhere"], required=False)) == []
 

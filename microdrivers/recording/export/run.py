@@ -172,7 +172,7 @@ def _maker(
     if to == "images":
         return lambda topic, _: ImageFolder(stage / files[topic], track_of(recording, topic), start_ns=start)
     if to == "video":
-        return lambda topic, found: VideoFile(stage / files[topic], rate_hz=found.rate_hz)
+        return lambda topic, found: VideoFile(stage / files[topic], rate_hz=found.usual_rate_hz)
     file = Hdf5File(stage / files[topics[0]], recording, start_ns=start)
     stack.callback(file.close)
     widths = text_widths(recording, topics)
