@@ -88,7 +88,8 @@ def test_info(run, run_file, tmp_path):
     found = json.loads(run("info", run_file, "--json").stdout)
     assert found["topics"]["camera"] | {"rate_hz": 0, "usual_rate_hz": 0} == {
         "sample_type": "Frame", "count": 30, "rate_hz": 0, "usual_rate_hz": 0, "first_s": 0.0,
-        "last_s": pytest.approx(29 / 30, abs=1e-3), "longest_gap_s": pytest.approx(1 / 30, abs=1e-3), "missing": 0, "dropped": 0, "repeated": 0, "unsorted": 0,
+        "last_s": pytest.approx(29 / 30, abs=1e-3), "longest_gap_s": pytest.approx(1 / 30, abs=1e-3),
+        "missing": 0, "dropped": 0, "repeated": 0, "unsorted": 0,
     }  # fmt: skip
 
 
