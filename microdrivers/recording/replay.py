@@ -145,9 +145,11 @@ class Replay:
         if self._frames_waiting < _FRAMES_AHEAD:
             for entry in self._source:
                 order = entry[1].order
-                if order > self._newest or order < 0:
+                if order > self._newest:
                     waiting.append(entry)
-                    self._newest = max(order, self._newest)
+                    self._newest = order
+                elif order < 0:  # never published: it has no place
+                    waiting.append(entry)
                 elif not self._insert(entry):
                     continue
                 self._frames_waiting += isinstance(entry[1], Frame)
@@ -179,8 +181,9 @@ class Replay:
 
     def _take_next(self) -> tuple[str, Sample]:
         entry = self._waiting.popleft()
-        self._taken = max(entry[1].order, self._taken)
-        if isinstance(entry[1], Frame):
+        if entry[1].order > self._taken:
+            self._taken = entry[1].order
+        if self._frames_waiting and isinstance(entry[1], Frame):
             self._frames_waiting -= 1
         if len(self._waiting) < _READ_AHEAD:
             self._fill()
