@@ -140,10 +140,10 @@ class Safety:
     # ------------------------------------------------------------------ the rig's end
 
     def finish(self) -> None:
-        """Wait until tools that are being taken away have got there."""
+        """Wait until tools that are being taken away have got there, and it is known whether they still press."""
         deadline_ns = self._clock.now_ns() + seconds_to_ns(_LONGEST_RETRACTION_S)
         for guard in self.guards.values():
-            guard.retraction.finish(max(0.0, (deadline_ns - self._clock.now_ns()) / NS_PER_S))
+            guard.finish(max(0.0, (deadline_ns - self._clock.now_ns()) / NS_PER_S))
 
     def disarm(self) -> None:
         """Nothing begins to move by itself from now on."""

@@ -13,11 +13,12 @@ from microdrivers.core.samples import ForceSample
 from microdrivers.core.units import NS_PER_MS, seconds_to_ns
 from microdrivers.devices.base import Device
 from microdrivers.devices.fine_stage import FineStage
-from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, STALE
+from microdrivers.devices.force_sensor import DISCONNECTED, SATURATED, STALE, ForceSensor
 from microdrivers.devices.motion_plan import MotionPlan
 from microdrivers.devices.stage import Stage
+from microdrivers.rig.safety_aftermath import Aftermath
 from microdrivers.rig.safety_force_flow import ForceFlow
-from microdrivers.rig.safety_retraction import Retraction, what_is_left
+from microdrivers.rig.safety_retraction import Retraction
 from microdrivers.rig.safety_section import ForceGuardSettings
 
 BY = "force guard"
@@ -40,6 +41,7 @@ LIMIT_REMEDY = (
     "tool has been taken away. If it touches nothing, it is the sensor's zero: tare, and state zero_within_uN, how far "
     "the zero may be off, in the rig file's safety section"
 )
+_MAY_PRESS = "; the tool may still press: retract() it, or free it by hand"
 _DATA_REMEDY = "check the force sensor, its cable and its amplifier; stop() and retract() work all the same"
 
 
@@ -92,8 +94,7 @@ class ForceGuard:
         self._braking_until_ns = -1
         self._least_uN = math.inf
         self._doubted_tare_uN = 0.0
-        self._newest: ForceSample | None = None
-        self._left_alone = False
+        self._aftermath = Aftermath(settings, clock=clock)
 
     # ------------------------------------------------------------------ what the rig asks
 
@@ -160,6 +161,11 @@ class ForceGuard:
             self._the_stage().stop(by=BY, reason="rehearsal")
         return self._clock.now_ns() - start_ns
 
+    def finish(self, timeout_s: float) -> None:
+        """Wait until a tool that is being taken away has got there, and it is known whether it still presses."""
+        if self._retraction.finish(timeout_s):
+            self._aftermath.wait()
+
     def disarm(self) -> None:
         """Nothing is retracted any more."""
         self._retraction.disarm()
@@ -175,7 +181,7 @@ class ForceGuard:
         """Judge a reading, and stop at once if it demands that; in the publisher's thread."""
         if STALE in sample.flags:
             return  # it is no reading: the age of the last one decides
-        self._newest, force_uN = sample, self._judged_uN(sample)
+        force_uN = self._judged_uN(sample)
         if abs(sample.tare_uN) > self.settings.zero_uN and sample.tare_uN != self._doubted_tare_uN:
             self._doubt_tare(sample.tare_uN)
         self._flow.take(sample)
@@ -185,8 +191,7 @@ class ForceGuard:
             self._hold_over_limit(force_uN, sample)
         elif self.tripped and abs(force_uN) <= _BELOW_SHARE * self.settings.max_force_uN:
             self._end_trip()
-        elif self._left_alone:
-            self._watch_what_follows(force_uN)
+        self._look_after(sample, force_uN)
 
     def _judged_uN(self, sample: ForceSample) -> float:
         """The force that counts; infinite if it is beyond the sensor's range, NaN if it is not known."""
@@ -260,28 +265,20 @@ class ForceGuard:
                 self.tripped = ""
 
     def _retraction_ended(self, what: str, succeeded: bool) -> None:
-        left, presses, self._left_alone = "", not succeeded, self._retraction.took_away
-        if self._left_alone:
-            force_uN = math.nan if self._newest is None or self._flow.complaint else self._judged_uN(self._newest)
-            left, presses = self._left(force_uN)
-        self._tell_left(f"{what}{left}", presses=presses)
+        sensor = self._devices.get(self.settings.sensor)
+        if succeeded and isinstance(sensor, ForceSensor):
+            self._aftermath.begin(self._the_stage(), sensor)
+        self._told(RETRACTION_RULE, f"{what}{'' if succeeded else _MAY_PRESS}", failed=not succeeded)
 
-    def _left(self, force_uN: float) -> tuple[str, bool]:
-        return what_is_left(self.settings, force_uN, tared=self._newest is not None and self._newest.tare_uN != 0.0)
-
-    def _watch_what_follows(self, force_uN: float) -> None:
-        """A specimen that gives slowly comes after a tool that was taken away by too little."""
-        if not self._retraction.took_away:
-            self._left_alone = False
-            return
-        left, presses = self._left(force_uN)
-        if presses:
-            self._tell_left(f"what it was taken away from has come after the tool{left}", presses=True)
-
-    def _tell_left(self, what: str, *, presses: bool) -> None:
-        self._left_alone = self._left_alone and not presses
-        remedy = "; the tool may still press: retract() it, or free it by hand" if presses else ""
-        self._told(RETRACTION_RULE, f"{what}{remedy}", failed=presses)
+    def _look_after(self, sample: ForceSample, force_uN: float) -> None:
+        """What the tool was taken away from may come after it."""
+        stage = self._stage
+        left_uN = self._aftermath.take(stage, sample, force_uN) if stage is not None else None
+        if left_uN is not None:
+            name = self.settings.sensor
+            feels = f"{name} is saturated" if math.isinf(left_uN) else f"{name} feels {left_uN:.4g} µN"
+            what = f"the tool was taken away, and {feels} where it stands{_MAY_PRESS}"
+            self._told(RETRACTION_RULE, what, value=left_uN, failed=True)
 
     def _excess(self, force_uN: float) -> str:
         name, limit_uN = self.settings.sensor, self.settings.max_force_uN

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections.abc import Callable
 
@@ -13,14 +12,10 @@ from microdrivers.core.samples import FineStageSample
 from microdrivers.core.units import seconds_to_ns
 from microdrivers.devices.fine_stage import FineStage
 from microdrivers.devices.motion import Move
-from microdrivers.rig.safety_section import ForceGuardSettings
 
 _STEP_S = 0.02
 _PATIENCE_S = 3.0
 """How long others may take to end what they were about to command."""
-
-_CLEAR_SHARE = 0.1
-"""Of a guard's limit: a tool that was taken away and feels more still presses."""
 
 _GIVEN_UP = "given up, since the rig is being closed"
 
@@ -135,19 +130,3 @@ class Retraction:
             timer.cancel()
         self._tell(what, succeeded)
         self._finished.set()
-
-
-def what_is_left(guard: ForceGuardSettings, force_uN: float, *, tared: bool) -> tuple[str, bool]:
-    """What the sensor feels when the tool has been taken away, in words, and whether it still presses.
-
-    Args:
-        guard: whose limit and zero count.
-        force_uN: what it judges; infinite if the sensor is saturated, NaN if it is not known.
-        tared: whether the zero is known.
-    """
-    if math.isnan(force_uN):
-        return f"; what {guard.sensor} feels there is not known", False
-    if math.isinf(force_uN):
-        return f", where {guard.sensor} is saturated", True
-    clear_uN = max(_CLEAR_SHARE * guard.max_force_uN, 0.0 if tared else guard.zero_uN)
-    return f", where {guard.sensor} feels {force_uN:.4g} µN", abs(force_uN) > clear_uN
