@@ -134,7 +134,8 @@ class Rig:
         finally:
             with INTERRUPTION.held():
                 self._stop_and_close()
-        INTERRUPTION.check()
+        if sys.exception() is None:  # else it is being ended as it is
+            INTERRUPTION.check()
 
     def _stop_and_close(self) -> None:
         self.safety.disarm()

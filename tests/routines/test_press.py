@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from microdrivers.core.clock import SimulatedClock
+from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.errors import (
     DataError,
     LinkLost,
@@ -26,6 +27,7 @@ from microdrivers.rig import open_rig
 from microdrivers.rig.safety_keep_out import KeepOut
 from microdrivers.rig.safety_section import KeepOutBox
 from microdrivers.routines.force import Characterisation, PressExperiment, sight
+from microdrivers.routines.force.probe_drive import ProbeDrive
 from microdrivers.routines.progress import SilentProgress
 from tests.routines.small_rig import SHORT, small_rig
 
@@ -101,6 +103,26 @@ def test_an_interruption_of_the_approach_takes_the_probe_away(rig):
     assert experiment.whereabouts.startswith(f"probe_stage stands at x {probe_um(rig):.1f} µm, y ")
     assert experiment.whereabouts.endswith("; no contact was felt")
     assert probe_um(rig) > -410.0 + AWAY_UM
+
+
+@pytest.mark.parametrize("begin", ["identifying", "at the end"])
+def test_a_first_interruption_after_the_press_waits_until_the_probe_is_away(rig, monkeypatch, begin):
+    steps = Steps("identifying the specimen", INTERRUPTION.request if begin == "identifying" else lambda: None)
+    experiment = PressExperiment(rig, SHORT)
+    take_away = ProbeDrive.take_away
+
+    def taking_away(drive):
+        if begin == "at the end":
+            INTERRUPTION.request()
+        take_away(drive)
+
+    monkeypatch.setattr(ProbeDrive, "take_away", taking_away)
+    characterisation, error = run(rig, steps=steps, experiment=experiment)
+    assert (error, characterisation.first.ended) == (None, True)
+    with pytest.raises(KeyboardInterrupt):
+        INTERRUPTION.check()
+    assert experiment.whereabouts.endswith("µm before the contact")
+    assert probe_um(rig) > -490.0 + AWAY_UM
 
 
 def test_an_interruption_of_the_press_keeps_what_was_measured_and_takes_the_probe_away(rig):

@@ -45,11 +45,11 @@ class Interruption:
     @contextmanager
     def held(self) -> Iterator[None]:
         """What is done must be done whole, waiting included: a first interruption is kept until afterwards."""
-        self._held = True
+        before, self._held = self._held, True
         try:
             yield
         finally:
-            self._held = False
+            self._held = before
 
     @contextmanager
     def waiting(self) -> Iterator[None]:

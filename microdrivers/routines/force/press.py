@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
+from microdrivers.core.clock.interruption import INTERRUPTION
 from microdrivers.core.contact_samples import DeformationSample
 from microdrivers.core.errors import ConfigError, LinkError, MicrodriversError, NotReferenced
 from microdrivers.core.samples import Frame
@@ -267,11 +268,12 @@ class PressExperiment:
     def finish(self) -> None:
         """Stop, and take the probe away if it may touch something; a guard that does so already is let finish.
 
-        A further Ctrl-C leaves the probe where it then is. Then, as when it cannot be taken away, `whereabouts` tells
-        where it was last seen, and what was felt there.
+        A first Ctrl-C that comes now waits for that; a further one leaves the probe where it then is. Then, as when it
+        cannot be taken away, `whereabouts` tells where it was last seen, and what was felt there.
         """
         try:
-            self._take_away()
+            with INTERRUPTION.held():
+                self._take_away()
         except KeyboardInterrupt:
             self.whereabouts = self._last_seen()
             self._stage.stop(by="characterisation", reason="interrupted")
