@@ -1,5 +1,7 @@
 """The life of a rig: opens all or nothing, reports every failure, stops everything in any case."""
 
+import gc
+
 import pytest
 
 from microdrivers.configs import shipped_rig
@@ -36,6 +38,15 @@ def test_an_emulated_rig_opens_identifies_and_moves_nothing():
         rig.clock.sleep(1.0)
         now = {name: axis.position_at(rig.clock.now_ns()) for name, axis in rig.simulation.world.stage_axes.items()}
         assert now == start
+
+
+def test_in_real_time_what_is_there_is_not_looked_through_for_garbage_while_the_rig_is_open():
+    """A whole collection halts every thread for longer than a force guard waits for data."""
+    with emulated():
+        assert gc.get_freeze_count() == 0
+    with open_rig(shipped_rig("microscope"), fake=True, clock=SystemClock()):
+        assert gc.get_freeze_count() > len(gc.get_objects())
+    assert gc.get_freeze_count() == 0
 
 
 def test_one_failing_device_closes_the_others():
