@@ -136,7 +136,7 @@ class LocalMotion:
         self._zero_ns: int | None = None
         self._newest: deque[_Position] = deque(maxlen=2)
         self._unscreened = False
-        self._points: deque[Point] = deque(maxlen=self.settings.window)
+        self._points: deque[Point] = deque(maxlen=int(self.settings.window))
         self._pending: deque[_Position] = deque()
         self._count = 0
         self._begin_ns = 0

@@ -58,7 +58,7 @@ def check_model(model: SpecimenModel) -> None:
 
     Raises:
         OutOfRange: a number is not finite (how deep and how fast may be infinite, but not 0 or less); the residual is
-            negative; a slip has no positive rate; the covariance is neither empty nor 3 × 3.
+            negative; a slip has no positive rate; the covariance is neither empty nor 9 numbers.
     """
     for name, value in model._asdict().items():
         if name == "covariance":
@@ -69,10 +69,13 @@ def check_model(model: SpecimenModel) -> None:
             raise _no_model(f"{name} is {value}")
     if model.slip_um != 0.0 and not model.slip_rate_per_s > 0.0:
         raise _no_model(f"slip of {model.slip_um:g} µm has the rate {model.slip_rate_per_s:g} /s, which is not above 0")
-    if len(model.covariance) not in (0, _PARAMETERS**2):
-        raise _no_model(f"covariance has {len(model.covariance)} entries, not 9 (3 × 3, row-major) or none")
-    if not all(map(math.isfinite, model.covariance)):
-        raise _no_model("covariance has an entry that is not finite")
+    covariance: object = model.covariance  # callers from notebooks have no type checker
+    if not isinstance(covariance, tuple | list):
+        raise _no_model(f"covariance is a {type(covariance).__name__}, not a tuple of 9 numbers (3 × 3, row-major)")
+    if len(covariance) not in (0, _PARAMETERS**2):
+        raise _no_model(f"covariance has {len(covariance)} entries, not 9 (3 × 3, row-major) or none")
+    if not all(isinstance(value, Real) and math.isfinite(value) for value in covariance):
+        raise _no_model("covariance has an entry that is not a finite number")
 
 
 def _no_model(what: str) -> OutOfRange:

@@ -160,7 +160,7 @@ def _in_floats(record: IndentationRecord) -> IndentationRecord:
         sigma = getattr(record, name)
         if not isinstance(sigma, Real) or sigma < 0.0 or math.isinf(sigma):
             raise DataError(
-                f"{name} is {sigma!r}", remedy="give a standard deviation above 0, or NaN where it is not known"
+                f"{name} is {sigma!r}", remedy="give a standard deviation of 0 or more, or NaN where it is not known"
             )
     return record._replace(
         time_s=real_array(record.time_s, what="time_s"),

@@ -78,6 +78,9 @@ def test_a_model_with_a_number_that_is_none_is_refused(name, value):
         {"slip_rate_per_s": -0.1},
         {"covariance": (1.0, 2.0)},
         {"covariance": np.eye(3)},
+        {"covariance": np.eye(3).ravel()},
+        {"covariance": None},
+        {"covariance": ("1.0",) * 9},
         {"covariance": (math.nan,) * 9},
     ],
 )

@@ -177,7 +177,8 @@ def test_a_column_that_holds_no_real_numbers_is_refused(good, column):
     values = getattr(good, column)
     refused(good._replace(**{column: values.astype(complex)}), DataError, f"{column} holds complex128")
     refused(good._replace(**{column: values.astype(str)}), DataError, f"{column} holds str")
-    refused(good._replace(**{column: 5.0}), DataError, "differ in length")
+    refused(good._replace(**{column: 5.0}), DataError, f"{column} is 5.0, not an array")
+    refused(good._replace(**{column: values[:, np.newaxis]}), DataError, "differ in length")
     masked = np.ma.masked_array(values, mask=np.arange(len(values)) == 300)
     refused(good._replace(**{column: masked}), DataError, f"{column} is not a number")
 

@@ -246,6 +246,15 @@ def test_settings_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
     assert caught.value.remedy
 
 
+def test_whole_numbers_may_be_those_of_numpy() -> None:
+    samples = indentation(SINGLE, depth_um=30.0)
+    settings = RecursionSettings()
+    same = settings._replace(
+        lag=np.int64(settings.lag), window=np.int64(settings.window), clearance=np.int64(settings.clearance)
+    )
+    assert repr(fed(SpecimenRecursion(same), samples)) == repr(fed(SpecimenRecursion(settings), samples))
+
+
 def test_a_contact_point_that_is_no_number_is_refused() -> None:
     with pytest.raises(OutOfRange, match="contact_um is nan"):
         SpecimenRecursion(contact_um=math.nan)

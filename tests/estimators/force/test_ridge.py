@@ -66,6 +66,7 @@ def test_a_column_without_information_gets_nothing():
         (np.ones((9, 0)), np.ones(9)),
         (np.ones((9, 1)), np.ones(9, dtype=complex)),
         (np.ones((9, 1)), np.ma.masked_array(np.ones(9), mask=np.arange(9) == 3)),
+        (np.float64(1.0), np.ones(9)),
         ([["a"]], [1.0]),
         ([[1.0], [1.0, 2.0]], [1.0, 1.0]),
     ],
@@ -92,3 +93,9 @@ def test_as_many_samples_as_columns_leave_nothing_to_tell_the_noise_by():
 def test_lists_are_taken_as_arrays():
     columns, force = regressors(6)
     assert np.array_equal(ridge_fit(columns.tolist(), force.tolist()).theta, ridge_fit(columns, force).theta)
+
+
+@pytest.mark.filterwarnings("ignore:the matrix subclass:PendingDeprecationWarning")
+def test_a_matrix_is_taken_as_an_array():
+    columns, force = regressors(6)
+    assert np.array_equal(ridge_fit(np.matrix(columns), force).theta, ridge_fit(columns, force).theta)
