@@ -25,7 +25,7 @@ def real_array(values: npt.ArrayLike, *, what: str) -> Array:
     except ValueError as error:
         raise DataError(f"{what} is not an array: {error}", remedy="give rows of the same length") from error
     if given.ndim == 0:
-        raise DataError(f"{what} is {str(given):.60}, not an array", remedy="give an array or a list of real numbers")
+        raise DataError(f"{what} is {given!s:.60}, not an array", remedy="give an array or a list of real numbers")
     if given.dtype.kind not in "fiu":
         raise DataError(f"{what} holds {given.dtype.name}, not real numbers", remedy="give an array of real numbers")
     array: Array = np.ma.filled(given.astype(np.float64, copy=False), np.nan)

@@ -95,9 +95,10 @@ class SpecimenWorld(DeviceSettings):
 
     A probe is a force sensor on a fine stage whose `origin_um` is stated. `preset` gives the figures that are not
     stated here, see `Mechanics` for what they mean; `spread` is the relative standard deviation of springs and dampers
-    from seed to seed. The surface lies 60 µm ahead of the probe's `ready_um` or, if the rig file states none, where
-    72 % of the probe's way is over, ± `place_spread_um`. Grains are what the embryo is textured with, drawn with that
-    mean distance; those within `cap_um` of the contact point move with it.
+    from seed to seed. The surface lies 60 µm ahead of the probe's `ready_um`, or of its place with all axes at 0 if
+    that is farther in, but at most at half of the way that the travel leaves; if the rig file states no `ready_um`,
+    where 72 % of the probe's way from 0 is over; ± `place_spread_um`. Grains are what the embryo is textured with,
+    drawn with that mean distance; those within `cap_um` of the contact point move with it.
     """
 
     preset: Literal["none", "single", "unloading_springs", "slip_corrected", "viscoelastic"] = "single"

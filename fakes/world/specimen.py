@@ -22,8 +22,9 @@ Stages = Mapping[str, Mapping[str, Axis]]
 _SHARE_OF_WAY = 0.72
 """Of the probe's way from its zero to the end of its travel, until it meets the surface."""
 
-_AHEAD_UM = 60.0
-"""Of the tip at its place before the specimen, where the rig file states that: the surface."""
+_AHEAD_UM, _SHARE_OF_REST = 60.0, 0.5
+"""Of the tip at its place before the specimen, where the rig file states that: the surface, but only up to this share
+of the way that is left until the travel ends."""
 
 _REACH_UM = 200.0
 _MOST_UPRIGHT = 0.7
@@ -201,9 +202,13 @@ class Specimen:
 
 def nominal_surface_um(probe: Probe) -> Array:
     """Where on the probe's line, in the rig's frame, the surface of a specimen should be."""
-    if probe.ready_um is not None:
-        return np.asarray(probe.ready_um + _AHEAD_UM * probe.direction)
     shares = probe.direction @ probe.tool.ways
     leading = int(np.abs(shares).argmax())
     way_um = float((shares[leading] * probe.tool.travel_um[leading]).max())
-    return np.asarray(probe.tool.origin_um + _SHARE_OF_WAY * way_um * probe.direction)
+    if probe.ready_um is None:
+        return np.asarray(probe.tool.origin_um + _SHARE_OF_WAY * way_um * probe.direction)
+    ready_um = float(probe.direction @ (probe.ready_um - probe.tool.origin_um))
+    # With its axes at 0, as after power-on, the tip must not be inside.
+    start_um = max(ready_um, 0.0)
+    ahead_um = min(_AHEAD_UM, _SHARE_OF_REST * (way_um - start_um))
+    return np.asarray(probe.ready_um + (start_um - ready_um + ahead_um) * probe.direction)

@@ -311,6 +311,8 @@ def _tell_what_is_left(
     if not measured and characterisation.interrupted:
         what = "interrupted before the specimen was pressed: there is no result"
         click.echo(f"{what}{'; ' * bool(recorded)}{recorded}", err=True)
+    elif measured and recorded and characterisation.tells_nothing:
+        click.echo(recorded, err=True)
     elif measured and recorded:
         command = shlex.join(["microdrivers", "calibrate", "force", "--replay", str(folder / RECORDING)])
         click.echo(f"{recorded}; to analyse it: {command}", err=True)

@@ -163,8 +163,14 @@ class RunOutput:
         Returns:
             the exit status: also whether the result is written, and all of the run recorded.
         """
-        written = write_results(self.folder, files)
-        self.progress.close()
+        try:
+            written = write_results(self.folder, files)
+        except KeyboardInterrupt:
+            self.close()
+            if not self._as_json:
+                click.echo(summary())
+            raise
+        self.close()
         if self._as_json:
             click.echo(result.as_json(), nl=False)
         else:

@@ -99,9 +99,12 @@ def test_an_experiment_that_fails_leaves_its_record_and_what_that_says(tmp_path,
     assert told in capsys.readouterr().err
 
 
-def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
+@pytest.mark.parametrize("recorded", [False, True])
+def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys, recorded):
     source = MadeUpSource(broken_off_at=60, error=KeyboardInterrupt())
     source.whereabouts = "probe_stage stands at x 10.0 µm; no contact was felt"
+    if recorded:
+        (tmp_path / "run.mcap").write_bytes(b"")
     with pytest.raises(KeyboardInterrupt):
         _run(opened(source), True, RunOutput("force", tmp_path, as_json=True))
     assert source.finished == 1
@@ -109,6 +112,7 @@ def test_an_interruption_before_the_contact_keeps_the_record(tmp_path, capsys):
     told = capsys.readouterr().err
     assert "record.csv; it cannot be analysed: no contact" in told
     assert "to analyse it" not in told
+    assert (f"{tmp_path / 'run.mcap'} holds the samples until then" in told) is recorded
     assert source.whereabouts in told
     assert not (tmp_path / "result.json").exists()
 
@@ -156,6 +160,7 @@ def test_an_interruption_of_the_report_names_what_is_there(run, tmp_path, monkey
     assert result.exit_code == 130
     assert "/out/ holds record.csv, result.json, specimen.yaml and lacks report.html" in result.stderr
     assert "choose another --out folder" in result.stderr
+    assert "k1 " in result.stdout
     read_force_result(tmp_path / "out" / "result.json")
     assert len(list((tmp_path / "out").iterdir())) == 3
 

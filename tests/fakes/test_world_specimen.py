@@ -30,11 +30,19 @@ def test_the_probe_meets_the_surface_where_it_should_be_and_feels_a_push_along_i
 
 def test_the_surface_lies_ahead_of_the_place_that_the_rig_file_states():
     rig = probe_rig()
-    rig["probe"] = {"force": "probe_force", "ready_um": [100.0, -20.0, 10.0]}
-    probe = find_probe(rig)
-    assert nominal_surface_um(probe).tolist() == [7990.0, 7480.0, 10.0]
+    rig["probe"] = {"force": "probe_force", "ready_um": [-100.0, -20.0, 10.0]}
+    assert nominal_surface_um(find_probe(rig)).tolist() == [7790.0, 7480.0, 10.0]
     rig["devices"]["probe_stage"]["axes"]["x"]["travel_um"] = [-450.0, 625.0]
-    assert nominal_surface_um(find_probe(rig)).tolist() == [7990.0, 7480.0, 10.0]
+    assert nominal_surface_um(find_probe(rig)).tolist() == [7790.0, 7480.0, 10.0]
+    rig["probe"]["ready_um"] = [-400.0, 0.0, 0.0]
+    assert nominal_surface_um(find_probe(rig)).tolist() == [7525.0, 7500.0, 0.0]
+
+
+@pytest.mark.parametrize("ready_um", [0.0, 100.0, 300.0])
+def test_a_tip_that_has_just_been_switched_on_is_not_inside_the_specimen(ready_um):
+    rig = probe_rig()
+    rig["probe"] = {"force": "probe_force", "ready_um": [ready_um, 0.0, 0.0]}
+    assert nominal_surface_um(find_probe(rig)).tolist() == [7890.0, 7500.0, 0.0]
 
 
 def test_a_tip_beside_or_above_passes():

@@ -89,9 +89,28 @@ def run(rig, settings=SHORT, steps=None, experiment=None):
 def test_no_contact_within_the_travel(rig):
     characterisation, error = run(rig, SHORT._replace(most_approach_um=20.0))
     assert isinstance(error, NoContact)
-    assert "no contact within 20 µm" in error.what
+    assert "no contact within 20 µm: the force" in error.what
+    assert "less deeply" not in error.remedy
     assert characterisation.first is None
     assert probe_um(rig) > -410.0 + AWAY_UM
+
+
+def test_no_contact_before_the_travel_leaves_no_more_than_the_depth(rig):
+    _, error = run(rig, SHORT._replace(depth_um=225.0))
+    assert isinstance(error, NoContact)
+    assert "no contact within 10 µm, where the stage's travel leaves just the 225 µm to be pressed" in error.what
+    assert error.remedy.endswith("or press less deeply")
+
+
+def test_where_the_probe_was_last_seen_tells_no_force_that_is_none(rig):
+    experiment = PressExperiment(rig, SHORT)
+    experiment.prepare(SilentProgress())
+    assert re.search(r"contact, with \S+ µN felt$", experiment._last_seen())
+    unread = msgspec.structs.replace(rig.devices["probe_force"].topic.latest, force_uN=float("nan"))
+    rig.devices["probe_force"].topic.publish(unread)
+    told = experiment._last_seen()
+    assert told.startswith("the probe was not taken farther away: probe_stage was last seen at x ")
+    assert told.endswith("µm before the contact")
 
 
 def test_an_interruption_of_the_approach_takes_the_probe_away(rig):
@@ -145,6 +164,7 @@ def test_a_probe_that_cannot_be_taken_away_is_said_to_press_and_where(rig, monke
     def fail_later():
         monkeypatch.setattr(rig.devices["probe_stage"], "retract", fail)
         monkeypatch.setattr(rig.devices["zoom"], "read", fail)
+        monkeypatch.setattr(type(rig), "fake", False)  # an emulated rig ends with the program that told of it
         interrupt()
 
     experiment = PressExperiment(rig, SHORT)

@@ -74,7 +74,7 @@ def find_specimen(
     while True:
         touch = _touch_below(limit_uN, sensor)
         with drive.readings(touch):
-            reached_um = _until_felt(drive, sensor, touch, end_um)
+            reached_um = _until_felt(drive, sensor, touch, end_um, settings)
             drive.go(reached_um - settings.back_off_um)
             clock.sleep(max(_AWAY_S, _AWAY_READINGS / sensor.stream_rate_hz))
         if touch.is_over:
@@ -116,14 +116,17 @@ def _touch_below(limit_uN: float, sensor: ForceSensor) -> Touch:
     return touch
 
 
-def _until_felt(drive: ProbeDrive, sensor: ForceSensor, touch: Touch, end_um: float) -> float:
+def _until_felt(drive: ProbeDrive, sensor: ForceSensor, touch: Touch, end_um: float, settings: PressSettings) -> float:
     reached_um = drive.run(end_um, lambda: touch.enough, below_limit=_APPROACH_GENTLY)
     touch.raise_if_saturated("on the approach", sensor=sensor.name)
     if not touch.enough:
+        by_travel = end_um < settings.most_approach_um
+        left = f", where the stage's travel leaves just the {settings.depth_um:g} µm to be pressed" if by_travel else ""
         raise NoContact(
-            f"no contact within {end_um:.0f} µm: the force stayed within ±{touch.touch_uN:.2g} µN",
+            f"no contact within {end_um:.0f} µm{left}: the force stayed within ±{touch.touch_uN:.2g} µN",
             device=sensor.name,
-            remedy="align the probe with the specimen, nearer to it; check the sensor's axis in the rig file",
+            remedy="align the probe with the specimen, nearer to it; check the sensor's axis in the rig file"
+            + ("; or press less deeply" if by_travel else ""),
             moved="yes",
         )
     return reached_um

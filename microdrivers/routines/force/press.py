@@ -112,7 +112,7 @@ class PressExperiment:
             clock=self.clock, progress=progress,
         )  # fmt: skip
         progress.step(f"contact after {contact.place_um:.1f} µm; back by {self.settings.back_off_um:g} µm")
-        require_free(self._rig, self._stage, way, contact.place_um + self.settings.depth_um)
+        require_free(self._rig, self._stage, way, contact.place_um + self.settings.depth_um, by_depth=True)
         self.clock.sleep(self.settings.rest_s)
         rest = [self._camera.grab() for _ in range(_REST_FRAMES)]
         ahead_um = contact.place_um - drive.place_um
@@ -283,9 +283,10 @@ class PressExperiment:
                 raise
             self.whereabouts = self._last_seen()
             error.what = f"{self.whereabouts}. {error.what}"
-            back = "once the connection is back: " if isinstance(error, LinkError) else ""
-            command = f"microdrivers move {self._rig.description.file} {self._stage.name} --retract"
-            error.remedy = f"{back}{command}; or free it by hand. {error.remedy}".strip()
+            if not self._rig.fake:
+                back = "once the connection is back: " if isinstance(error, LinkError) else ""
+                command = f"microdrivers move {self._rig.description.file} {self._stage.name} --retract"
+                error.remedy = f"{back}{command}; or free it by hand. {error.remedy}".strip()
             raise
 
     def _take_away(self) -> None:
@@ -312,10 +313,16 @@ class PressExperiment:
         pose, force = self._stage.topic.latest, self._sensor.topic.latest
         if not self._near:
             return "" if pose is None else f"{self._stage.name} was last seen at {_written(pose.position)}"
-        at = "" if pose is None else f" at {_written(pose.position)}, {self._from_contact(pose.position)}"
-        felt = "" if force is None else f", with {force.force_uN:.4g} µN felt"
-        may = "" if at.endswith("before the contact") else " and may be pressing"
-        return f"the probe was not taken away{may}: {self._stage.name} was last seen{at}{felt}"
+        place = "" if pose is None else self._from_contact(pose.position)
+        at = "" if pose is None else f" at {_written(pose.position)}, {place}"
+        felt = "" if force is None or math.isnan(force.force_uN) else f", with {force.force_uN:.4g} µN felt"
+        if place.endswith("before the contact"):
+            what = "the probe was not taken farther away"
+        elif self._contact is None:
+            what = "the probe was not taken away and may be near the specimen"
+        else:
+            what = "the probe was not taken away and may be pressing"
+        return f"{what}: {self._stage.name} was last seen{at}{felt}"
 
     def setup(self) -> IndentationSetup:
         """Names, speed, scale and zoom."""

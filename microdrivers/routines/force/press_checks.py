@@ -49,13 +49,22 @@ def check_press(
             f"{settings.depth_um:g} µm are to be pressed, and back for {behind_um:.0f} µm, of which "
             f"{settings.free_travel_um:g} µm are needed",
             device=stage.name,
-            remedy="choose a place nearer to the middle of the travel (ready_um in the rig file), or press less deeply",
+            remedy="choose a place nearer to the middle of the travel (ready_um in the rig file)"
+            + (", or press less deeply" if behind_um >= settings.free_travel_um else ""),
         )
-    require_free(rig, stage, way, -settings.free_travel_um, max(approach_um, settings.depth_um))
+    farthest_um = max(approach_um, settings.depth_um)
+    require_free(rig, stage, way, -settings.free_travel_um, farthest_um, by_depth=settings.depth_um > approach_um)
 
 
-def require_free(rig: Rig, stage: FineStage, way: ProbingWay, *places_um: float) -> None:
+def require_free(rig: Rig, stage: FineStage, way: ProbingWay, *places_um: float, by_depth: bool) -> None:
     """Refuse a way, from its start to the first place and on to the others, that a keep-out box blocks.
+
+    Args:
+        rig: with the boxes.
+        stage: that moves.
+        way: its way.
+        places_um: on that way.
+        by_depth: the last place is so far only because the specimen is to be pressed so deeply.
 
     Raises:
         UnsafeError: one does.
@@ -67,5 +76,6 @@ def require_free(rig: Rig, stage: FineStage, way: ProbingWay, *places_um: float)
         raise UnsafeError(
             f"the way on which the probe looks for the specimen and presses is not free: {error.what}",
             device=stage.name,
-            remedy="correct ready_um or the box in the rig file, use another place, or press less deeply",
+            remedy="correct ready_um or the box in the rig file, or use another place"
+            + (", or press less deeply" if by_depth else ""),
         ) from error
