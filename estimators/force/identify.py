@@ -154,7 +154,7 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     prepared, on_ramps = settled(record, settings.around_reversal)
     fits = all_protocols(prepared, on_ramps)
     both_ways = "single" in fits
-    protocols = {name: judge(prepared, name, fit, both_ways=both_ways) for name, fit in fits.items()}
+    protocols = {name: judge(prepared, name, fit) for name, fit in fits.items()}
     best = _best(protocols)
     protocols = _rivals_marked(protocols, best)
     if best == "slip_corrected":

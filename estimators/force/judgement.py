@@ -21,14 +21,13 @@ from microdrivers.estimators.force.ridge import ridge_fit
 from microdrivers.estimators.force.structure import StructureTest, structure_test
 
 
-def judge(prepared: Prepared, name: ProtocolName, fit: Fit, *, both_ways: bool) -> ProtocolFit:
+def judge(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolFit:
     """What a fit says of the specimen, and how well it explains the samples.
 
     Args:
         prepared: the samples.
         name: of the protocol.
         fit: of it.
-        both_ways: the way back was fitted, too.
     """
     motion = motion_everywhere(prepared, fit)
     force, fitted = prepared.force_uN[prepared.used], force_of(fit.theta, motion)
@@ -70,7 +69,7 @@ def judge(prepared: Prepared, name: ProtocolName, fit: Fit, *, both_ways: bool) 
         within_noise=fit.within_noise,
         misfit=misfit,
         deepest_um=_deepest_um(prepared, motion),
-        **_fastest(prepared, fit, motion, both_ways=both_ways),
+        **_fastest(prepared, fit, motion, both_ways=protocol.explains_both_ways),
         likelihood_cost=solution.cost + fit.parameters * float(np.log(2 * solution.samples)),
         **named_parameters(fit.theta, fit.covariance),
     )
@@ -85,13 +84,16 @@ def _deepest_um(prepared: Prepared, motion: Motion) -> float:
 
 
 def _fastest(prepared: Prepared, fit: Fit, motion: Motion, *, both_ways: bool) -> dict[str, float]:
-    """Largest speed while loading and while unloading, of the contact point or, where that is faster, of x."""
+    """Largest speed while loading and while unloading, of the contact point or, where that is faster, of x.
+
+    A fit of the loading alone tells no damper for the way back, at any speed.
+    """
     none = np.zeros(len(prepared.used))
     slipping_um_s = -motion_of(fit.theta, prepared.time_s[prepared.used], none, none, none).velocity_um_s
     speeds = np.stack([motion.velocity_um_s, motion.velocity_um_s + slipping_um_s])
     in_um_s = float(np.max(speeds[:, prepared.branch == LOADING]))
     out = -speeds[:, prepared.branch == UNLOADING]
-    return {"fastest_um_s": in_um_s, "fastest_unloading_um_s": float(np.max(out)) if both_ways else in_um_s}
+    return {"fastest_um_s": in_um_s, "fastest_unloading_um_s": float(np.max(out)) if both_ways else 0.0}
 
 
 def _percent(left: Array, force: Array) -> float:

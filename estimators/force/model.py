@@ -30,7 +30,7 @@ class SpecimenModel(NamedTuple):
         residual_uN: RMS of what the model left over when it was identified.
         deepest_um: largest compression x that was characterised; with a slip, the deformation was deeper by that.
         fastest_um_s, fastest_unloading_um_s: largest speeds that were characterised while the compression grows and
-            while it shrinks; both positive.
+            while it shrinks; the latter is 0 where nothing is known of the way back.
     """
 
     k1_uN_per_um: float
@@ -48,7 +48,9 @@ class SpecimenModel(NamedTuple):
     fastest_unloading_um_s: float = math.inf
 
 
-_REACHES = ("deepest_um", "fastest_um_s", "fastest_unloading_um_s")
+_POSITIVE = ("deepest_um", "fastest_um_s")
+_NOT_NEGATIVE = ("residual_uN", "fastest_unloading_um_s")
+_MAY_BE_INFINITE = ("deepest_um", "fastest_um_s", "fastest_unloading_um_s")
 _PARAMETERS = 3
 """That the covariance is of."""
 
@@ -57,15 +59,16 @@ def check_model(model: SpecimenModel) -> None:
     """Refuse a model that tells no force. A damper may be negative: a specimen may be fitted best by one.
 
     Raises:
-        OutOfRange: a number is not finite (how deep and how fast may be infinite, but not 0 or less); the residual is
-            negative; a slip has no positive rate; the covariance is neither empty nor 9 numbers.
+        OutOfRange: a number is not finite (how deep and how fast may be infinite, but not 0 or less, save on the way
+            back); the residual or a speed is negative; a slip has no positive rate; the covariance is neither empty
+            nor 9 numbers.
     """
     for name, value in model._asdict().items():
         if name == "covariance":
             continue
         number = float(value) if isinstance(value, Real) else math.nan
-        fine = number > 0.0 if name in _REACHES else math.isfinite(number)
-        if not fine or (name == "residual_uN" and number < 0.0):
+        fine = math.isfinite(number) or (number == math.inf and name in _MAY_BE_INFINITE)
+        if not fine or (name in _POSITIVE and number <= 0.0) or (name in _NOT_NEGATIVE and number < 0.0):
             raise _no_model(f"{name} is {value}")
     if model.slip_um != 0.0 and not model.slip_rate_per_s > 0.0:
         raise _no_model(f"slip of {model.slip_um:g} µm has the rate {model.slip_rate_per_s:g} /s, which is not above 0")

@@ -72,8 +72,8 @@ class ProtocolFit:
         within_noise: noise alone explains the residuals.
         misfit: test of the residual's structure.
         deepest_um: largest compression among the samples. fastest_um_s, fastest_unloading_um_s: largest speeds among
-            them, of the contact point or, where that is faster, of the compression; without an unloading the latter
-            is that of the loading.
+            them, of the contact point or, where that is faster, of the compression; the latter is 0 where the way
+            back was not fitted.
         likelihood_cost: −2·log-likelihood but for a constant, plus the price of the parameters (Schwarz' criterion).
     """
 

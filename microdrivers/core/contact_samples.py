@@ -67,8 +67,9 @@ class SpecimenEstimate(Sample, frozen=True, gc=False, kw_only=True):
 class VisionForceSample(Sample, frozen=True, gc=False, kw_only=True):
     """Force read from the camera alone, through an identified model; on `estimate/force`.
 
-    Flags: OUTSIDE_RANGE (deeper or faster than the model was identified), LOST (the contact point is not seen),
-    NO_VELOCITY (frames too far apart to tell a speed), MAY_BE_RELEASED (at rest on the way back, with a force left).
+    Flags: OUTSIDE_RANGE (deeper or faster than the model was identified, or on a way back of which it knows nothing),
+    LOST (the contact point is not seen), NO_VELOCITY (frames too far apart to tell a speed), MAY_BE_RELEASED (at rest
+    on the way back, with a force left).
     """
 
     force_uN: float

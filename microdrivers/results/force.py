@@ -114,7 +114,8 @@ class Misfit(Record):
 class VisionCheck(Record):
     """A fresh indentation of the same specimen with the force from the camera alone, against the sensor.
 
-    All its frames count, reversals included. `left_over_uN` is the largest force that the camera still told where the
+    All its frames count, reversals included; in `error_within_range_percent` those that are not `outside_range`, if
+    there are such frames. `left_over_uN` is the largest force that the camera still told where the
     specimen rested on its way back, flagged MAY_BE_RELEASED, and the sensor felt less than half of it; None if nowhere.
     `largest_error_s` and `deepest_s` are instants of `ForceTraces.check_*`.
     """
@@ -126,6 +127,7 @@ class VisionCheck(Record):
     largest_error_s: float | None = None
     deepest_s: float | None = None
     left_over_uN: float | None = None
+    error_within_range_percent: float | None = None
 
 
 class ForceTraces(Record):

@@ -77,5 +77,5 @@ def read_specimen(file: Path) -> SpecimenModel:
         residual_uN=found.residual_uN,
         deepest_um=valid_for.deepest_um,
         fastest_um_s=valid_for.fastest_um_s,
-        fastest_unloading_um_s=valid_for.fastest_unloading_um_s or valid_for.fastest_um_s,
+        fastest_unloading_um_s=valid_for.fastest_unloading_um_s or 0.0,
     )

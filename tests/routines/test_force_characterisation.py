@@ -95,12 +95,12 @@ def test_the_specimen_file_reads_force_as_the_run_did(characterised, tmp_path):
     assert model.residual_uN > 0.0
 
 
-def test_a_specimen_file_of_before_has_one_speed_for_both_ways(characterised, tmp_path):
+def test_a_specimen_file_without_a_speed_back_knows_nothing_of_that_way(characterised, tmp_path):
     file = tmp_path / "specimen.yaml"
     characterised[2].write_specimen(file)
     file.write_text("".join(line for line in file.read_text().splitlines(True) if "fastest_unloading" not in line))
     model = read_specimen(file)
-    assert model.fastest_unloading_um_s == model.fastest_um_s
+    assert model.fastest_unloading_um_s == 0.0
 
 
 def test_pressed_and_valid_are_told_apart_where_the_specimen_slips(tmp_path):

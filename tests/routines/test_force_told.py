@@ -172,3 +172,19 @@ def test_the_page_of_what_is_no_embryo_is_short_and_without_the_papers_figures()
     assert "paper 4.5161" not in text
     assert "paper" not in summary.split("\n\n")[1]
     assert "µm/\u2060s" in text
+
+
+def test_how_good_the_camera_is_within_the_range_of_the_model_is_said(characterised):
+    _, run, result, _ = characterised
+    assert result.vision_check.error_within_range_percent is None
+    outside = [
+        msgspec.structs.replace(force, force_uN=1.5 * force.force_uN, flags=frozenset({"OUTSIDE_RANGE"}))
+        if force.velocity_um_s < -1.0
+        else force
+        for force in run.check.forces
+    ]
+    spoilt = result_of(run._replace(check=run.check._replace(forces=outside)))
+    assert spoilt.vision_check.error_percent > 20.0
+    assert spoilt.vision_check.error_within_range_percent < 5.0
+    (note,) = [note for note in spoilt.notes if "lie outside the range" in note]
+    assert re.search(r"identified; in the others its force is within [\d.]+ % RMS\.$", note)

@@ -110,19 +110,20 @@ def compare(check: Indentation) -> VisionCheck | None:
         return None
     measured = np.array([sample.force_uN for sample, _ in pairs])
     seen = np.array([force.force_uN for _, force in pairs])
-    if np.sum(np.abs(measured) > TOUCHES_UN) < _FEWEST_IN_CONTACT:
-        return None
-    power = float(np.sqrt(np.mean(measured**2)))
     off = np.abs(seen - measured)
+    error_percent = _error_percent(off, measured)
+    if error_percent is None:
+        return None
+    outside = np.array([OUTSIDE_RANGE in force.flags for _, force in pairs])
     since_s = [(sample.t_ns - pairs[0][0].t_ns) / NS_PER_S for sample, _ in pairs]
     pressed_um = [sample.deformation_um for sample, _ in pairs]
     return VisionCheck(
-        error_percent=100.0 * float(np.sqrt(np.mean(off**2))) / power,
+        error_percent=error_percent,
         largest_error_uN=float(np.max(off)),
         largest_error_s=since_s[int(np.argmax(off))],
         deepest_s=since_s[int(np.argmax(pressed_um))] if pressed_um[-1] < _CAME_BACK * max(pressed_um) else None,
         samples=len(pairs),
-        outside_range=sum(OUTSIDE_RANGE in force.flags for _, force in pairs),
+        outside_range=int(np.sum(outside)),
         left_over_uN=max(
             (
                 force.force_uN
@@ -131,7 +132,15 @@ def compare(check: Indentation) -> VisionCheck | None:
             ),
             default=None,
         ),
+        error_within_range_percent=_error_percent(off[~outside], measured[~outside]) if outside.any() else None,
     )
+
+
+def _error_percent(off_uN: Array, measured_uN: Array) -> float | None:
+    """RMS of what is off, of the RMS of the force; None where hardly any frame felt a force."""
+    if np.sum(np.abs(measured_uN) > TOUCHES_UN) < _FEWEST_IN_CONTACT:
+        return None
+    return 100.0 * float(np.sqrt(np.mean(off_uN**2)) / np.sqrt(np.mean(measured_uN**2)))
 
 
 def _pairs(check: Indentation) -> list[tuple[IndentationSample, VisionForceSample]]:
@@ -249,7 +258,7 @@ def _setup(run: ForceRun, best: ProtocolFit, largest_uN: float) -> Setup:
         unloading_speed_um_s=out_um_s if known.speed_um_s is None or out_um_s is None else known.speed_um_s,
         pressed_um=float(np.nanmax(run.record.deformation_um)) - best.contact_um,
         fastest_um_s=best.fastest_um_s,
-        fastest_unloading_um_s=best.fastest_unloading_um_s if both_ways else None,
+        fastest_unloading_um_s=best.fastest_unloading_um_s or None,
     )
 
 
@@ -286,6 +295,11 @@ def _trace(values: Sequence[float] | Array) -> Trace:
 
 def _known(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
+
+
+def _within_range(check: VisionCheck) -> str:
+    error_percent = check.error_within_range_percent
+    return "" if error_percent is None else f"; in the others its force is within {error_percent:.2g} % RMS"
 
 
 def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
@@ -327,7 +341,7 @@ def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
     if check is not None and check.outside_range:
         notes.append(
             f"{check.outside_range} of {check.samples} frames of the fresh indentation lie outside the range in which "
-            "the model was identified."
+            f"the model was identified{_within_range(check)}."
         )
     if check is None and run.check is not None:
         began = run.check.began

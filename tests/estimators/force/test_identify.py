@@ -543,7 +543,13 @@ def test_a_way_back_that_is_too_short_tells_no_speed():
     found = identify(recorded("single", Push(back_um_s=28.0)))
     assert len(found.branches.unloading)
     fit = found.protocols["loading"]
-    assert fit.fastest_unloading_um_s == fit.fastest_um_s == pytest.approx(5.0, abs=0.3)
+    assert fit.fastest_um_s == pytest.approx(5.0, abs=0.3)
+    assert fit.fastest_unloading_um_s == 0.0
+
+
+def test_the_loading_alone_tells_no_speed_back_though_others_do():
+    protocols = identified("single").protocols
+    assert {name for name, fit in protocols.items() if fit.fastest_unloading_um_s == 0.0} == {"loading", "loading_only"}
 
 
 def test_a_tip_that_leaves_as_it_turns_back_has_not_left_while_it_pressed():

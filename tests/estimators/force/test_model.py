@@ -57,7 +57,7 @@ def test_stiffness_is_the_slope_of_the_springs():
 def test_a_model_may_have_a_negative_damper_no_covariance_and_no_limits():
     check_model(MODEL)
     check_model(MODEL._replace(b_loading_uN_s_per_um=-1.0, covariance=(1.0,) * 9, deepest_um=np.float32(100.0)))
-    check_model(MODEL._replace(slip_um=0.0, slip_rate_per_s=0.0))
+    check_model(MODEL._replace(slip_um=0.0, slip_rate_per_s=0.0, fastest_unloading_um_s=0.0))
 
 
 @pytest.mark.parametrize("name", [name for name in SpecimenModel._fields if name != "covariance"])
@@ -72,7 +72,8 @@ def test_a_model_with_a_number_that_is_none_is_refused(name, value):
     "change",
     [
         {"deepest_um": 0.0},
-        {"fastest_um_s": -1.0},
+        {"fastest_um_s": 0.0},
+        {"fastest_unloading_um_s": -1.0},
         {"residual_uN": -1.0},
         {"slip_rate_per_s": 0.0},
         {"slip_rate_per_s": -0.1},

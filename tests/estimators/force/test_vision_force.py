@@ -197,6 +197,11 @@ def test_beyond_the_characterised_range_is_said() -> None:
     outside = [force.velocity_um_s for force in told if "OUTSIDE_RANGE" in force.flags]
     assert len(outside) > 200
     assert max(outside) < -3.0
+    no_way_back = fed(VisionForce(preset._replace(deepest_um=200.0, fastest_unloading_um_s=0.0)), frames(record))
+    felt_back = [force for force in no_way_back if force.velocity_um_s < -1.0 and force.force_uN > 0.0]
+    assert len(felt_back) > 200
+    assert all("OUTSIDE_RANGE" in force.flags for force in felt_back)
+    assert not any(force.velocity_um_s > 0.0 for force in no_way_back if "OUTSIDE_RANGE" in force.flags)
 
 
 def test_uncertain_model_widens_sigma() -> None:
