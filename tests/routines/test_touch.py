@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -116,6 +117,18 @@ def frames(surface_um, *, count=200, depth_um=40.0):
 @pytest.mark.parametrize("surface_um", [-2.0, 0.0, 25.0])
 def test_the_camera_shows_where_the_surface_lies(surface_um):
     assert surface_ahead_um(frames(surface_um)) == pytest.approx(surface_um, abs=1e-9)
+
+
+def test_a_specimen_that_recovers_more_slowly_than_the_tip_goes_back_shows_its_surface_all_the_same():
+    pressed = list(frames(0.0))
+    last = pressed[-1]
+    left_behind = [
+        msgspec.structs.replace(
+            last, t_ns=last.t_ns + k, tip_um=last.tip_um - 0.7 * k, deformation_um=last.deformation_um - 0.05 * k
+        )
+        for k in range(1, 3 * len(pressed))
+    ]
+    assert surface_ahead_um([*pressed, *left_behind]) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_tool_that_presses_on_nothing_shows_no_surface():

@@ -19,10 +19,13 @@ _ROUNDS = 60
 def surface_ahead_um(deformations: Iterable[DeformationSample]) -> float | None:
     """How far beyond the contact that was felt the camera shows the specimen's surface; negative before it.
 
-    While the tool presses, tip and contact point move as one: their distance is that of the two zeros. None if too few
-    frames show both.
+    While the tool presses, tip and contact point move as one: their distance is that of the two zeros. On its way back
+    the tip may leave a specimen that recovers more slowly, so that only frames until then count. None if too few frames
+    show both.
     """
     seen = [sample for sample in deformations if sample.found and math.isfinite(sample.tip_um)]
+    turn = max(range(len(seen)), key=lambda k: seen[k].tip_um, default=-1)
+    seen = seen[: turn + 1]
     least_um = _NEARLY_DEEPEST * max((sample.deformation_um for sample in seen), default=0.0)
     pressed = [sample for sample in seen if sample.deformation_um > max(least_um, 1.0)]
     if len(pressed) < _FEWEST:
