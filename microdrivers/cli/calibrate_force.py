@@ -320,7 +320,7 @@ def _tell_what_is_left(
         click.echo(_what_to_do_with(folder / RECORD, characterisation.tells_nothing), err=True)
     if found is not None and write_results(folder, _files(_result(found, known, truth, output), output)):
         output.close()
-        click.echo(f"what it says of the specimen is in {folder}/: result.json, report.html", err=True)
+        click.echo(f"what it says of the specimen is in {folder}/: result.json, specimen.yaml, report.html", err=True)
 
 
 def _what_to_do_with(record: Path, tells_nothing: str) -> str:

@@ -233,7 +233,8 @@ class Stage(Device[PoseT]):
     def _check_targets(self, targets: Mapping[str, float]) -> None:
         if not targets:
             raise OutOfRange(
-                "a move needs at least one target", remedy=f"give one of {', '.join(self.axis_names)} with its unit"
+                "a move needs at least one target, or a distance that is not 0",
+                remedy=f"give one of {', '.join(self.axis_names)} with its unit",
             )
         for axis, target in targets.items():
             unit = self.axes[axis].unit

@@ -68,7 +68,7 @@ class Safety:
         guard = self.guards.get(sensor)
         if guard is None:
             return None
-        return guard.settings.max_force_uN - (tare_uN - guard.settings.zero_of_uN(tare_uN))
+        return guard.settings.max_force_uN - max(tare_uN - guard.settings.zero_of_uN(tare_uN), 0.0)
 
     def max_speed_um_s(self, sensor: str) -> float:
         """The largest speed that a sensor's guard allows its stage; infinite if it states none."""

@@ -42,6 +42,7 @@ LIMIT_REMEDY = (
     "the zero may be off, in the rig file's safety section"
 )
 _MAY_PRESS = "; the tool may still press: retract() it, or free it by hand"
+_OR_ZERO = ". If it touches nothing, it is the sensor's zero: tare, and state zero_within_uN in the rig file"
 _DATA_REMEDY = "check the force sensor, its cable and its amplifier; stop() and retract() work all the same"
 
 
@@ -59,7 +60,8 @@ class ForceGuard:
     """One entry of `force_guards`. `take` is called with each reading before anybody else sees it.
 
     What is judged is the raw force less the tare, but a tare counts only as far as a zero can be off: what goes beyond
-    `zero_uN` is load, so that no tare under load defeats the limit. A saturated reading is over any limit.
+    `zero_uN` is load, so that no tare under load defeats the limit. Where the tared force is larger than that, it is
+    judged: a zero far below 0 leaves no more to press with. A saturated reading is over any limit.
 
     A trip stops the guarded stage, then every other stage that may be moving; the tool is then retracted, if a move of
     its stage has been allowed since the rig was opened: before that it may be in somebody's hands.
@@ -199,7 +201,7 @@ class ForceGuard:
             return math.nan
         if SATURATED in sample.flags:
             return math.inf
-        return self._load_uN(sample)
+        return max(self._load_uN(sample), sample.raw_uN - sample.tare_uN, key=abs)
 
     def _load_uN(self, sample: ForceSample) -> float:
         """The raw force less as much of the tare as a zero can be off; of a saturated sensor, where it stands."""
@@ -277,7 +279,7 @@ class ForceGuard:
         if left_uN is not None:
             name = self.settings.sensor
             feels = f"{name} is saturated" if math.isinf(left_uN) else f"{name} feels {left_uN:.4g} µN"
-            what = f"the tool was taken away, and {feels} where it stands{_MAY_PRESS}"
+            what = f"the tool was taken away, and {feels} where it stands{_MAY_PRESS}{_OR_ZERO}"
             self._told(RETRACTION_RULE, what, value=left_uN, failed=True)
 
     def _excess(self, force_uN: float) -> str:

@@ -380,7 +380,7 @@ def test_samples_of_others_are_none_of_its_business(guarded):
     assert guarded.rig.safety.limit_uN("other_force") is None
 
 
-@pytest.mark.parametrize(("tare_uN", "limit_uN"), [(60.0, LIMIT_UN), (300.0, 800.0), (-300.0, 1200.0)])
+@pytest.mark.parametrize(("tare_uN", "limit_uN"), [(60.0, LIMIT_UN), (300.0, 800.0), (-300.0, LIMIT_UN)])
 def test_the_limit_of_a_tared_push_is_where_the_guard_trips(guarded, tare_uN, limit_uN):
     guarded.press(tare_uN)
     guarded.sensor.tare(0.5)

@@ -12,7 +12,11 @@ from tests.rig.guarded_rig import AT_LIMIT_UM, LIMIT_UN, PERIOD_NS, SENSOR, STAG
     ("retract_um", "said", "failed"),
     [
         ((400.0, 0.0, 0.0), "the tool was taken away, to x [^;]*$", False),
-        ((10.0, 0.0, 0.0), "probe_force feels 80[0-9.]* µN where it stands; the tool may still press", False),
+        (
+            (10.0, 0.0, 0.0),
+            "probe_force feels 80[0-9.]* µN where it stands; the tool may still press: .*zero_within_uN",
+            False,
+        ),
         ((1000.0, 0.0, 0.0), "the tool was taken away by 7[23] % of retract_um, for no more is free, to x", False),
         ((0.0, 0.0, 500.0), "by 0 % of retract_um, for no more is free, .*; the tool may still press", True),
     ],

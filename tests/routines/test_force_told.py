@@ -4,6 +4,7 @@ import dataclasses
 import re
 
 import msgspec
+import numpy as np
 import pytest
 
 from microdrivers.core.bus import Bus
@@ -189,3 +190,31 @@ def test_how_good_the_camera_is_within_the_range_of_the_model_is_said(characteri
     assert spoilt.vision_check.error_percent > 10.0 * within_percent
     (note,) = [note for note in spoilt.notes if "lie outside the range" in note]
     assert re.search(r"identified; in the others its force is within [\d.]+ % RMS\.$", note)
+
+
+def test_why_the_specimen_was_not_pressed_as_deeply_as_asked_for_is_said(characterised):
+    _, run, result, _ = characterised
+    deep_um = result.setup.pressed_um
+
+    def told(*, asked_um, limit_uN=None, ended=True):
+        first = run.first._replace(turned_at_uN=limit_uN, ended=ended)
+        notes = result_of(run._replace(first=first, setup=run.setup._replace(depth_um=asked_um))).notes
+        return [note for note in notes if note.startswith("The probe ")]
+
+    assert told(asked_um=deep_um) == told(asked_um=deep_um + 50.0, ended=False) == []
+    assert told(asked_um=deep_um + 50.0, limit_uN=1200.0) == [
+        "The probe turned back at 1200 µN, the largest force that it may press with, after "
+        f"{deep_um:.3g} of {deep_um + 50.0:g} µm."
+    ]
+    (note,) = told(asked_um=1.3 * deep_um)
+    assert note.startswith(f"The probe went on by {1.3 * deep_um:g} µm beyond the contact that it had felt, and the ")
+    assert f"pressed by {deep_um:.3g} µm" in note
+
+
+def test_a_speed_limit_that_no_speed_keeps_is_not_told(characterised):
+    _, run, result, _ = characterised
+    assert result.largest_speed_um_s > 0.0
+    clipped = run.record._replace(force_uN=np.minimum(run.record.force_uN, 0.5 * np.nanmax(run.record.force_uN)))
+    told = result_of(run._replace(record=clipped))
+    assert told.largest_speed_um_s is None
+    assert "Speed limit" not in force_summary(told)

@@ -113,6 +113,16 @@ def test_where_the_probe_was_last_seen_tells_no_force_that_is_none(rig):
     assert told.endswith("µm before the contact")
 
 
+@pytest.mark.parametrize("begin", ["tare", "the probe's travel in sight"])
+def test_an_interruption_before_the_approach_takes_the_probe_away_too(rig, begin):
+    experiment = PressExperiment(rig, SHORT)
+    characterisation, error = run(rig, steps=Steps(begin, lambda: later(rig, 0.1, interrupt)), experiment=experiment)
+    assert isinstance(error, NoContact)
+    assert characterisation.interrupted
+    assert experiment.whereabouts.endswith("; no contact was felt")
+    assert probe_um(rig) > -390.0 + AWAY_UM
+
+
 def test_an_interruption_of_the_approach_takes_the_probe_away(rig):
     steps = Steps("approach until contact", lambda: later(rig, 0.5, interrupt))
     experiment = PressExperiment(rig, SHORT)
@@ -270,6 +280,7 @@ def test_the_limit_of_force_ends_the_press_before_the_guard_must_act(rig, monkey
     characterisation, error = run(rig, SHORT._replace(max_force_uN=200.0))
     assert error is None
     assert 190.0 < max(sample.force_uN for sample in characterisation.first.samples) < 215.0
+    assert characterisation.first.turned_at_uN == 200.0
     assert set(depths_um) == {SHORT.depth_um}  # the patch stays in view as deep as is pressed
 
 
@@ -287,7 +298,8 @@ def test_a_limit_that_ends_the_press_at_once_is_named(rig, later_s, tells):
     assert not isinstance(error, NoContact)
     assert "turned back at" in error.what
     assert "beyond the limit of 20 µN" in error.what
-    assert "press more slowly than 40 µm/s" in error.remedy
+    assert error.remedy.startswith("allow more force: --max-force-uN")
+    assert error.remedy.endswith("press more slowly than 40 µm/s")
     assert len(characterisation.first.frames) > 20
     assert probe_um(rig) > -490.0 + AWAY_UM
     assert characterisation.partial(error) is None

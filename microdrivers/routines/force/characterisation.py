@@ -52,6 +52,7 @@ class Indentation(NamedTuple):
         arrivals: bus-wide order numbers in the order in which the estimators saw the samples. recorded: these samples,
             if asked for.
         began: whether the tool had set out. ended: whether it had come back, and rested.
+        turned_at_uN: the limit of force that had turned it back; None if that did not, or it had not come back.
     """
 
     samples: list[IndentationSample]
@@ -66,6 +67,7 @@ class Indentation(NamedTuple):
     recorded: list[Sample]
     began: bool
     ended: bool
+    turned_at_uN: float | None
 
 
 class ForceRun(NamedTuple):
@@ -285,6 +287,7 @@ class _Session:
             recorded=[] if self._host is None else self._host.recorded,
             began=self._host is not None,
             ended=rests is not None,
+            turned_at_uN=None if rests is None else rests.turned_at_uN,
         )
 
     def _publish(self, sample: Sample) -> None:

@@ -101,12 +101,12 @@ class PressExperiment:
         self._drive = drive = ProbeDrive(
             self._rig, self._stage, self._sensor, way, speed_um_s=self.settings.speed_um_s, free_um_s=self._free_um_s
         )
+        self._near = True
         progress.step("tare: the probe touches nothing")
         self._tare()
         travel = self._travel_in_sight(drive, progress)
         self._sight.learn(*travel[:2], scale_hint_px_per_um=travel.scale_hint_px_per_um)
         progress.step("approach until contact")
-        self._near = True
         self._contact = contact = find_specimen(
             drive, self._sensor, self.settings, limit_uN=self._limit_at(self._sensor.tared), retare=self._tare,
             clock=self.clock, progress=progress,
@@ -232,7 +232,10 @@ class PressExperiment:
             lost.raise_if_too_long(self._camera.name)
             self.clock.sleep(_AFTER_S)
             # A place read at rest is off by up to half a step, either time.
-            rests = Rests(until_ns, since_ns, back_um - rested_um, drive.way.step_um / math.sqrt(6.0))
+            rests = Rests(
+                until_ns, since_ns, back_um - rested_um, drive.way.step_um / math.sqrt(6.0),
+                turned_at_uN=limit_uN if at_limit and not felt.saturated else None,
+            )  # fmt: skip
             note(self.bus, self.clock, END, rests._asdict())
         pressed_um = deepest_um - contact_um
         felt.raise_if_too_soon(pressed_um, speed_um_s=asked.speed_um_s, sensor=self._sensor.name)
@@ -331,7 +334,8 @@ class PressExperiment:
             sensor=self._sensor.name, stage=self._stage.name, camera=self._camera.name,
             scale_source=self._sight.source, scale_px_per_um=self._sight.scale_px_per_um,
             scale_sigma_px_per_um=self._sight.scale_sigma_px_per_um, zoom=self._zoom,
-            speed_um_s=self.settings.speed_um_s, tare_uN=None if tare is None else tare.offset_uN,
+            speed_um_s=self.settings.speed_um_s, depth_um=self.settings.depth_um,
+            tare_uN=None if tare is None else tare.offset_uN, bandwidth_hz=self._sensor.bandwidth_hz,
             guarded=self._guarded,
             touch_uN=None if self._contact is None else self._contact.touch_uN,
             touched_s=None if self._contact is None else self._contact.pressed_s,

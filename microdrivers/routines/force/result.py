@@ -31,8 +31,10 @@ from microdrivers.results.force import (
 from microdrivers.results.record import Provenance, Trace
 from microdrivers.routines.force.characterisation import ForceRun, Indentation
 from microdrivers.routines.force.frames import TOUCHES_UN
+from microdrivers.routines.force.result_notes import TARED_IN_CONTACT, began_in_contact, notes_of
+from microdrivers.routines.force.sensor_lag import beyond_intervals, lag_biases, lag_s
 from microdrivers.routines.force.source import IndentationSetup
-from microdrivers.routines.force.touch_checks import slip_used_up_um, surface_ahead_um
+from microdrivers.routines.force.touch_checks import slip_used_up_um
 
 Array = npt.NDArray[np.float64]
 
@@ -42,11 +44,6 @@ _CAME_BACK = 0.5
 
 _USED_UP = 0.03
 """Of a slip: more than this, used up by the approach, and what is found is not the specimen's own."""
-
-_SURFACE_UM = 3.0
-"""Farther than this from where the approach felt a contact, the surface lies elsewhere."""
-
-_TARED_IN_CONTACT = "the probe still pressed when it had gone back, and the sensor's zero was taken there"
 
 _LEFT = 0.5
 """Of the camera's force: what the sensor feels less than, of a specimen that has been let go."""
@@ -85,22 +82,39 @@ def build_result(run: ForceRun, provenance: Provenance) -> ForceResult:
         force_sigma_uN=found.force_sigma_uN,
         setup=_setup(run, best, largest_uN),
         traces=_traces(run),
-        notes=_notes(run, check),
+        notes=notes_of(run, check),
         provenance=provenance,
     )
 
 
 def _trusted(run: ForceRun) -> Mapping[ProtocolName, ProtocolFit]:
-    """The protocols; nothing is determined by a press that began in contact, for the sensor was tared there."""
-    protocols = run.identification.protocols
-    if not _began_in_contact(run):
-        return protocols
-    return {name: fit.with_weak(dict.fromkeys(fit.identifiable, _TARED_IN_CONTACT)) for name, fit in protocols.items()}
+    """The protocols, with what the arrangement does not let them determine.
+
+    Nothing, if the press began in contact, for the sensor was tared there; otherwise what a slow sensor shifts.
+    """
+
+    def doubts(fit: ProtocolFit) -> dict[str, str]:
+        if began_in_contact(run):
+            return dict.fromkeys(fit.identifiable, TARED_IN_CONTACT)
+        return _shifted_by_lag(fit, run.setup)
+
+    return {name: fit.with_weak(doubts(fit)) for name, fit in run.identification.protocols.items()}
 
 
-def _began_in_contact(run: ForceRun) -> bool:
-    """Whether the probe of a rig still pressed when it had gone back from the touch."""
-    return run.setup.touch_uN is not None and run.identification.contact.seen == "nothing"
+def _shifted_by_lag(fit: ProtocolFit, setup: IndentationSetup) -> dict[str, str]:
+    if setup.bandwidth_hz is None or setup.speed_um_s is None:
+        return {}
+    late_s = lag_s(setup.bandwidth_hz)
+    biases = lag_biases(fit, late_s, speed_um_s=setup.speed_um_s)
+    shifted = beyond_intervals(biases, _covariance(fit, _relative_scale_sigma(setup)))
+    if not shifted:
+        return {}
+    by_how_much = ", ".join(f"{name} by about {bias:+.2g}" for name, bias in shifted.items())
+    why = (
+        f"with its bandwidth of {setup.bandwidth_hz:g} Hz the sensor is {1e3 * late_s:.2g} ms late, which shifts "
+        f"{by_how_much}, beyond what the intervals hold"
+    )
+    return dict.fromkeys(biases, why)
 
 
 def compare(check: Indentation) -> VisionCheck | None:
@@ -149,9 +163,8 @@ def _pairs(check: Indentation) -> list[tuple[IndentationSample, VisionForceSampl
 
 
 def _protocol(fit: ProtocolFit, scale_sigma: float) -> ProtocolResult:
-    """With what the scale's own uncertainty adds: a length wrong by a share of itself is so in every sample."""
-    slopes = scale_sigma * np.array([fit.k1_uN_per_um, 3.0 * fit.k2_uN_per_um3, fit.b_loading_uN_s_per_um])
-    covariance = fit.covariance + np.outer(slopes, slopes)
+    """What a result tells of a fit."""
+    covariance = _covariance(fit, scale_sigma)
     known = bool(np.isfinite(covariance).all())
     sigmas = np.sqrt(np.diag(covariance).clip(min=0.0))
     return ProtocolResult(
@@ -172,6 +185,13 @@ def _protocol(fit: ProtocolFit, scale_sigma: float) -> ProtocolResult:
             **{name: fit.identifiable.get(name, False) for name in ("k1", "k2", "b", "m")}, reasons=dict(fit.weak)
         ),
     )
+
+
+def _covariance(fit: ProtocolFit, scale_sigma: float) -> Array:
+    """With what the scale's own uncertainty adds: a length wrong by a share of itself is so in every sample."""
+    slopes = scale_sigma * np.array([fit.k1_uN_per_um, 3.0 * fit.k2_uN_per_um3, fit.b_loading_uN_s_per_um])
+    covariance: Array = fit.covariance + np.outer(slopes, slopes)
+    return covariance
 
 
 def _relative_scale_sigma(setup: IndentationSetup) -> float:
@@ -221,7 +241,8 @@ def _speed_limit(best: ProtocolFit, force_uN: float) -> float | None:
     if not (best.identifiable["k1"] and best.identifiable["b"]):
         return None
     try:
-        return _known(speed_limit(best.model(), max_force_uN=force_uN, depth_um=best.deepest_um).speed_um_s)
+        limit = speed_limit(best.model(), max_force_uN=force_uN, depth_um=best.deepest_um)
+        return None if limit.limited_by == "static_force" else _known(limit.speed_um_s)
     except MicrodriversError:  # the model says nothing about speeds here
         return None
 
@@ -295,69 +316,3 @@ def _trace(values: Sequence[float] | Array) -> Trace:
 
 def _known(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def _within_range(check: VisionCheck) -> str:
-    error_percent = check.error_within_range_percent
-    return "" if error_percent is None else f"; in the others its force is within {error_percent:.2g} % RMS"
-
-
-def _notes(run: ForceRun, check: VisionCheck | None) -> list[str]:
-    notes = [f"{note[0].upper()}{note[1:]}." for note in run.identification.notes]
-    protocols = run.identification.protocols
-    beyond = [
-        f"{name} ({fit.noise_residual_ratio:.3g} × noise)"
-        for name, fit in protocols.items()
-        if fit.misfit.found and not all(fit.identifiable[key] for key in ("k1", "k2", "b"))
-    ]
-    if beyond:
-        notes.append(
-            f"The model does not explain the record as fitted by {', '.join(beyond)}: do not quote its numbers."
-        )
-    ahead_um = surface_ahead_um(run.first.deformations) if run.setup.touch_uN is not None else None
-    if _began_in_contact(run):
-        notes.append(
-            f"Nothing is determined: {_TARED_IN_CONTACT}. A faster approach, or a sensor with less noise, feels the "
-            "specimen earlier."
-        )
-    elif ahead_um is not None and abs(ahead_um) > _SURFACE_UM:
-        notes.append(
-            f"The camera shows the surface {abs(ahead_um):.3g} µm {'beyond' if ahead_um > 0.0 else 'before'} where the "
-            "approach felt a contact: the specimen was pressed less or more deeply than asked for by as much."
-        )
-    if run.setup.camera is not None and run.first.drift is None and not run.first.ended:
-        notes.append(
-            "How far the picture drifted is not known, as the record ends before the probe was away again: it was not "
-            "taken off, and the intervals do not contain it."
-        )
-    if not run.setup.guarded:
-        notes.append("No force guard watched over the indentation: the rig file's safety section states none.")
-    if not run.complete:
-        notes.append(f"The run ended early: {run.ended_by}. The result holds what had been measured until then.")
-    notes += run.past_run.notes()
-    lost = run.first.unmatched.get("LOST", 0)
-    if lost:
-        notes.append(f"The contact point was not seen in {lost} frames.")
-    if check is not None and check.outside_range:
-        notes.append(
-            f"{check.outside_range} of {check.samples} frames of the fresh indentation lie outside the range in which "
-            f"the model was identified{_within_range(check)}."
-        )
-    if check is None and run.check is not None:
-        began = run.check.began
-        notes.append(
-            f"The check indentation {'ended before the probe had pressed noticeably' if began else 'had not begun'}; "
-            "camera-based force could not be assessed."
-        )
-    if check is not None and check.left_over_uN is not None:
-        notes.append(
-            f"The camera still indicated up to {check.left_over_uN:.3g} µN after contact was lost in the check "
-            "indentation; the surface now lies deeper than the model assumes. Such frames are flagged MAY_BE_RELEASED."
-        )
-    best = protocols[run.identification.best]
-    if best.misfit.found:
-        notes.append(
-            "The model does not explain this specimen within the noise: use its parameters with care, and its force "
-            "from the camera only near the conditions of this record."
-        )
-    return notes

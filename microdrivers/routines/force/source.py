@@ -34,18 +34,20 @@ class IndentationNames(NamedTuple):
 
 
 class Rests(NamedTuple):
-    """The tool at rest out of contact, before and after an indentation.
+    """The tool at rest out of contact, before and after an indentation, and why it turned between.
 
     Attributes:
         until_ns, since_ns: when the first rest ended, and the second began.
         travel_um: how much farther along the direction of probing its encoders say that it was in the second.
         travel_sigma_um: standard deviation of it.
+        turned_at_uN: the limit of force that turned it back before it had come to its depth; None if that did not.
     """
 
     until_ns: int
     since_ns: int
     travel_um: float
     travel_sigma_um: float
+    turned_at_uN: float | None = None
 
 
 class FrameTracker(Protocol):
@@ -60,8 +62,8 @@ class IndentationSetup(NamedTuple):
 
     Attributes:
         scale_source: where µm come from.
-        speed_um_s: of the tool while loading.
-        tare_uN: the sensor's zero that was in use.
+        speed_um_s: of the tool while loading. depth_um: how far it was to go beyond the contact.
+        tare_uN: the sensor's zero that was in use. bandwidth_hz: of the sensor.
         guarded: whether a force guard of the rig watched.
         touch_uN: the rise of the force by which the approach found the specimen. touched_s: how long it felt it.
     """
@@ -78,6 +80,8 @@ class IndentationSetup(NamedTuple):
     guarded: bool = True
     touch_uN: float | None = None
     touched_s: float | None = None
+    depth_um: float | None = None
+    bandwidth_hz: float | None = None
 
 
 class IndentationSource(Protocol):

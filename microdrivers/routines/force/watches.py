@@ -83,8 +83,9 @@ class Felt:
             f"turned back at {self.force_uN:.4g} µN, beyond the limit of {self._threshold_uN:.4g} µN, after "
             f"{max(depth_um, 0.0):.1f} µm from contact: too little to tell springs from a damper",
             device=sensor,
-            remedy=f"press more slowly than {speed_um_s:g} µm/s (a damper's force b·v is there from the first µm on), "
-            "or allow more force: --max-force-uN, and the guard's limit in the rig file's safety section",
+            remedy="allow more force: --max-force-uN, and the guard's limit in the rig file's safety section; or, if "
+            "it is a damper's, whose force b·v is there from the first µm on, press more slowly than "
+            f"{speed_um_s:g} µm/s",
             moved="yes",
         )
 
