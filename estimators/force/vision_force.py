@@ -64,9 +64,8 @@ class VisionForce:
     Flags: `LOST`, no deformation was seen; `NO_VELOCITY`, there is no velocity and so no force, both NaN
     (without any damper, the springs' force is told all the same, and only the velocity is NaN);
     `OUTSIDE_RANGE`, deeper or faster than the model was characterised, or on a way back of which it knows nothing;
-    `MAY_BE_RELEASED`, the specimen rests on its
-    way back with a force left by the model, beyond noise: the tool holds it there, or has left a specimen that lies
-    farther in than the model has it, which a camera cannot tell apart.
+    `MAY_BE_RELEASED`, the specimen rests on its way back with a force left by the model, beyond noise: the tool holds
+    it there, or has left a specimen that lies farther in than the model has it, which a camera cannot tell apart.
 
     Args:
         model: the identified specimen.
