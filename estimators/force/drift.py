@@ -41,6 +41,7 @@ class Baseline(NamedTuple):
     Attributes:
         middle_s: mean instant of the samples that tell it.
         level_uN, slope_uN_s: each followed by its standard deviation; that of a slope that was not estimated is 0.
+        stepped_uN: how much higher the force stands after the press, if it has not come there along a line.
     """
 
     middle_s: float
@@ -48,6 +49,7 @@ class Baseline(NamedTuple):
     sigma_level_uN: float
     slope_uN_s: float
     sigma_slope_uN_s: float
+    stepped_uN: float = 0.0
 
     @property
     def is_clear(self) -> bool:
@@ -66,6 +68,20 @@ def line_through(time_s: Array, force_uN: Array, sigma_uN: float) -> Baseline:
     square = float(t @ t)
     sigma_level, sigma_slope = (sigma_uN / float(np.sqrt(weight)) for weight in (len(t), square))
     return Baseline(middle, level, sigma_level, float(t @ force_uN) / square, sigma_slope)
+
+
+def is_step(parts: Sequence[tuple[Array, Array]], line: Baseline, sigma_uN: float) -> bool:
+    """Whether levels of their own explain the parts of a force out of contact better than one line, beyond noise.
+
+    Args:
+        parts: time_s and force_uN of each.
+        line: through all of them.
+        sigma_uN: standard deviation of the noise.
+    """
+    worse = sum(
+        float(np.sum((force - line.at(time_s)) ** 2) - np.sum((force - np.mean(force)) ** 2)) for time_s, force in parts
+    )
+    return worse > _LIKELY * sigma_uN**2
 
 
 def straight_drift(time_s: Array, force_uN: Array, sigma_uN: float) -> Baseline | None:

@@ -156,10 +156,15 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     both_ways = "single" in fits
     protocols = {name: judge(prepared, name, fit) for name, fit in fits.items()}
     best = _best(protocols)
-    protocols = _rivals_marked(protocols, best)
+    protocols = _contradicted_by(protocols[best], _rivals_marked(protocols, best))
     if best == "slip_corrected":
         protocols[best] = protocols[best].with_weak(_hidden_by_slip(prepared, fits[best], protocols[best]))
     slip = _slip(prepared, protocols, best)
+    if slip is not None and not _may_be_slip(protocols["slip_corrected"]):
+        no_slip = dict.fromkeys(
+            protocols["slip_corrected"].springs_and_damper, f"what it takes for slip is none: {slip.reason}"
+        )
+        protocols["slip_corrected"] = protocols["slip_corrected"].with_weak(no_slip)
     notes = notes_on(record, prepared, both_ways=both_ways)
     if settings.protocol not in {None, best}:
         notes.append(f"{settings.protocol} was asked for; {best} would be preferred")
@@ -204,6 +209,28 @@ def _rivals_marked(
             if _is_ruled_out(one, other) or abs(mine - its) > _APART * math.hypot(my_sigma, its_sigma):
                 weak[name] = f"{other.name} explains {how} with {its:.3g}"
         marked[one.name] = marked[one.name].with_weak(weak)
+    return marked
+
+
+def _contradicted_by(
+    best: ProtocolFit, protocols: Mapping[ProtocolName, ProtocolFit]
+) -> dict[ProtocolName, ProtocolFit]:
+    """Where nothing explains both branches, neither is what the loading says by itself the specimen's own."""
+    if not PROTOCOLS[best.name].explains_both_ways or not best.misfit.found:
+        return dict(protocols)
+    marked = dict(protocols)
+    for one in protocols.values():
+        if PROTOCOLS[one.name].explains_both_ways:
+            continue
+        both = best.springs_and_damper
+        apart = [
+            f"{name} of {both[name][0]:.3g}"
+            for name, (mine, my_sigma) in one.springs_and_damper.items()
+            if abs(mine - both[name][0]) > _APART * math.hypot(my_sigma, both[name][1])
+        ]
+        if apart:  # one of them takes the others along
+            why = f"no protocol explains both branches, and {best.name} fits them with {', '.join(apart)}"
+            marked[one.name] = one.with_weak(dict.fromkeys(both, why))
     return marked
 
 

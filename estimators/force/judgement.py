@@ -51,7 +51,7 @@ def judge(prepared: Prepared, name: ProtocolName, fit: Fit) -> ProtocolFit:
         Motion(*(part[fitted_to] for part in motion)),
         slips=protocol.slips,
         structured_uN=structure.structured_uN if structure.found else 0.0,
-        misfit=f"the model does not explain the record: {beyond}" if structure.found else "",
+        misfit=f"the model does not explain the samples that it is fitted to: {beyond}" if structure.found else "",
     )
     names = ["k1", "k2", "b", "m", *(["slip", "slip_rate"] if protocol.slips else [])]
     return ProtocolFit(

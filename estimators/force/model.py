@@ -27,7 +27,8 @@ class SpecimenModel(NamedTuple):
         slip_um: how far the specimen slips into its holder in the end, eq. (26).
         slip_rate_per_s: α of eq. (26).
         covariance: of (k1, k2, b_loading), row-major 3 × 3, in these units; empty if unknown.
-        residual_uN: RMS of what the model left over when it was identified.
+        residual_uN: RMS of what the model left over of the force when it was identified, without what the noise of
+            the deformation explains.
         deepest_um: largest compression x that was characterised; with a slip, the deformation was deeper by that.
         fastest_um_s, fastest_unloading_um_s: largest speeds that were characterised while the compression grows and
             while it shrinks; the latter is 0 where nothing is known of the way back.

@@ -71,6 +71,12 @@ def _zero(baseline: Baseline | None, time_s: Array, least_uN: float) -> list[str
     """What was taken off the force, if it ever was that much."""
     if baseline is None:
         return []
+    if baseline.stepped_uN:
+        return [
+            f"the force out of contact is {baseline.level_uN:.3g} µN before the press and "
+            f"{baseline.level_uN + baseline.stepped_uN:.3g} µN after it, each steady: the sensor's zero has stepped, "
+            "or something sticks to the tip. The former is taken off; do not use the way back"
+        ]
     first_uN, last_uN = baseline.at(time_s[[0, -1]])
     if max(abs(first_uN), abs(last_uN)) < least_uN:
         return []

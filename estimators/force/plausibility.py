@@ -49,6 +49,7 @@ def doubts(prepared: Prepared) -> list[str]:
     elif 0.0 < speed_um_s < SLOW_UM_S:
         found.append(
             f"units in doubt: the loading is at {speed_um_s:.3g} µm/s, one sample every {prepared.frame_s:.2g} s; if "
-            "the time column was in ms, divide it by 1000 and start again"
+            "the time column was in ms, divide it by 1000, if the deformation was in mm, multiply it by 1000 (and the "
+            "force, if it was in mN), and start again"
         )
     return found

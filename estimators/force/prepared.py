@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from microdrivers.core.errors import DataError, SaturatedData
 from microdrivers.estimators.force.branches import Branches, find_branches
-from microdrivers.estimators.force.drift import CLEAR_SLOPE, SHORTEST_BASELINE, Baseline, line_through
+from microdrivers.estimators.force.drift import CLEAR_SLOPE, SHORTEST_BASELINE, Baseline, is_step, line_through
 from microdrivers.estimators.force.joint import BASE, CONTACT, CONTACT_S, PARAMETERS, Prior
 from microdrivers.estimators.force.model import Array
 from microdrivers.estimators.force.record import IndentationRecord, Mask, lost, saturated, white_sigma
@@ -263,18 +263,23 @@ def _turning(time_s: Array, branches: Branches, around: int, margins: Margins) -
 def _baseline(
     time_s: Array, force: Array, branches: Branches, measured: Mask, sigma: float, around: int
 ) -> Baseline | None:
-    """The force out of contact: a constant, or a line if there is enough of it at both ends and it drifts clearly."""
+    """The force out of contact: a constant, or a line if there is enough of it at both ends and it drifts clearly.
+
+    A zero that has stepped meanwhile is that of before: at least the loading then has its own.
+    """
     before = _at_rest(range(branches.approach.start, branches.approach.stop - around), measured)
     after = _at_rest(range(branches.lost.start + around, branches.lost.stop), measured)
-    rest = np.concatenate([before, after])
+    rest, stepped_uN = np.concatenate([before, after]), 0.0
     if not len(rest):
         return None
     if min(len(before), len(after)) >= SHORTEST_BASELINE:
         line = line_through(time_s[rest], force[rest], sigma)
         if line.is_clear:
-            return line
+            if not is_step([(time_s[part], force[part]) for part in (before, after)], line, sigma):
+                return line
+            rest, stepped_uN = before, float(np.mean(force[after]) - np.mean(force[before]))
     level, sigma_level = float(np.mean(force[rest])), sigma / float(np.sqrt(len(rest)))
-    return Baseline(float(np.mean(time_s[rest])), level, sigma_level, 0.0, 0.0)
+    return Baseline(float(np.mean(time_s[rest])), level, sigma_level, 0.0, 0.0, stepped_uN)
 
 
 def _at_rest(part: range, measured: Mask) -> Indices:

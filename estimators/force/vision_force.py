@@ -164,11 +164,13 @@ class VisionForce:
                 raw_uN = float(force_uN(self.model, x_um, v_um_s, adhesion=True))
         elif raw_uN <= 0.0:
             self._touches = False
+        if not self._touches and motion.position_um - self.model.contact_um < _AT_REST_UM:
+            self._touched_ns = None
+        # That no force is left is the model's word, too, until the specimen has come back.
+        outside = self._touched_ns is not None and self._is_outside(motion, x_um, v_um_s)
+        flags = {OUTSIDE_RANGE} if outside else set()
         if not self._touches:
-            if motion.position_um - self.model.contact_um < _AT_REST_UM:
-                self._touched_ns = None
-            return self._publish(frame, 0.0, noise_uN, velocity_um_s, set())
-        flags = {OUTSIDE_RANGE} if self._is_outside(motion, x_um, v_um_s) else set()
+            return self._publish(frame, 0.0, noise_uN, velocity_um_s, flags)
         if self._rests_on_its_way_back(motion) and raw_uN > _TOUCH_SIGMAS * seen_uN:
             flags.add(MAY_BE_RELEASED)
         sigma_uN = math.hypot(noise_uN, self._model_sigma_uN(x_um, v_um_s))

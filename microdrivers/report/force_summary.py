@@ -92,7 +92,10 @@ def _performance(result: ForceResult) -> list[str]:
     if result.largest_speed_um_s is not None:
         force_uN = significant(result.setup.largest_force_uN, 4)
         fastest = significant(result.largest_speed_um_s, 3)
-        rows.append(("Speed limit", f"up to {fastest} µm/s the force stays below {force_uN} µN in that range"))
+        slip_out = ", the slip left out" if result.best == "slip_corrected" else ""
+        rows.append(
+            ("Speed limit", f"up to {fastest} µm/s the force stays below {force_uN} µN in that range{slip_out}")
+        )
     excluded = excluded_text(result)
     if excluded:
         rows.append(("Not used", f"samples: {excluded}"))

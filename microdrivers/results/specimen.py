@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +13,8 @@ from microdrivers.core.errors import ConfigError
 from microdrivers.estimators.force.model import SpecimenModel
 
 _Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+_log = logging.getLogger(__name__)
+
 _Row = tuple[_Finite, _Finite, _Finite]
 
 
@@ -42,6 +45,7 @@ class _Specimen(_Part):
     contact_um: _Finite
     residual_uN: Annotated[_Finite, pydantic.Field(ge=0.0)]
     slip: _Slip | None
+    misfit: bool = False
     valid_for: _ValidFor
 
 
@@ -49,6 +53,7 @@ def read_specimen(file: Path) -> SpecimenModel:
     """Read the `specimen.yaml` of a force characterisation.
 
     The model is that of the specimen when it was first touched: of one that slips, x = 0 lies farther in afterwards.
+    The log warns of one that does not explain its own record.
 
     Returns:
         What `microdrivers.estimators.force.vision_force.VisionForce` needs.
@@ -63,6 +68,8 @@ def read_specimen(file: Path) -> SpecimenModel:
             f"not a specimen of schema version 1: {error}",
             file=str(file), remedy="give the specimen.yaml of `microdrivers calibrate force`",
         ) from error  # fmt: skip
+    if found.misfit:
+        _log.warning("%s: the model does not explain its specimen within noise (misfit): its force is no better", file)
     slip, covariance, valid_for = found.slip, found.covariance_of_k1_k2_b, found.valid_for
     return SpecimenModel(
         k1_uN_per_um=found.k1_uN_per_um,

@@ -95,6 +95,16 @@ def test_the_specimen_file_reads_force_as_the_run_did(characterised, tmp_path):
     assert model.residual_uN > 0.0
 
 
+def test_a_specimen_file_of_a_misfit_is_read_with_a_warning(characterised, tmp_path, caplog):
+    file = tmp_path / "specimen.yaml"
+    characterised[2].write_specimen(file)
+    read_specimen(file)
+    assert not caplog.text
+    file.write_text(file.read_text().replace("misfit: false", "misfit: true"))
+    read_specimen(file)
+    assert f"{file}: the model does not explain its specimen within noise" in caplog.text
+
+
 def test_a_specimen_file_without_a_speed_back_knows_nothing_of_that_way(characterised, tmp_path):
     file = tmp_path / "specimen.yaml"
     characterised[2].write_specimen(file)
