@@ -95,6 +95,7 @@ class ForceGuard:
         self._stopped_ns = -_AGAIN_NS
         self._braking_until_ns = -1
         self._least_uN = math.inf
+        self._most_uN = 0.0
         self._doubted_tare_uN = 0.0
         self._aftermath = Aftermath(settings, clock=clock)
 
@@ -218,7 +219,8 @@ class ForceGuard:
             is_new, self.tripped = not self.tripped, self.tripped or reason
         retracting = self._retraction.active or (stage is not None and stage.retracting)
         if is_new:
-            self._least_uN = math.inf
+            self._least_uN, self._most_uN = math.inf, 0.0
+        self._most_uN = max(self._most_uN, force_uN, key=abs)
         if retracting:
             self._watch_retraction(stage, force_uN, sample)
         elif is_new:
@@ -270,7 +272,10 @@ class ForceGuard:
         sensor = self._devices.get(self.settings.sensor)
         if succeeded and isinstance(sensor, ForceSensor):
             self._aftermath.begin(self._the_stage(), sensor)
-        self._told(RETRACTION_RULE, f"{what}{'' if succeeded else _MAY_PRESS}", failed=not succeeded)
+        most_uN = self._most_uN
+        most = "beyond the sensor's range" if math.isinf(most_uN) else f"{most_uN:.5g} µN"
+        told = f"{what} (the largest force was {most}){'' if succeeded else _MAY_PRESS}"
+        self._told(RETRACTION_RULE, told, value=most_uN, failed=not succeeded)
 
     def _look_after(self, sample: ForceSample, force_uN: float) -> None:
         """What the tool was taken away from may come after it."""
@@ -279,6 +284,8 @@ class ForceGuard:
         if left_uN is not None:
             name = self.settings.sensor
             feels = f"{name} is saturated" if math.isinf(left_uN) else f"{name} feels {left_uN:.4g} µN"
+            if abs(sample.tare_uN) > self.settings.zero_uN:
+                feels += f" (of its tare of {sample.tare_uN:.4g} µN only {self.settings.zero_uN:g} µN count)"
             what = f"the tool was taken away, and {feels} where it stands{_MAY_PRESS}{_OR_ZERO}"
             self._told(RETRACTION_RULE, what, value=left_uN, failed=True)
 

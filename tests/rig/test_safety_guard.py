@@ -334,6 +334,16 @@ def test_ctrl_c_stops_at_once_also_while_the_tool_is_being_taken_away(tmp_path):
     assert guarded.true_x_um(guarded.clock.now_ns() + 10**9) < AT_LIMIT_UM + RETRACT_UM / 2
 
 
+def test_how_large_the_force_became_is_told_when_the_tool_is_away(guarded):
+    press_too_hard(guarded, speed_um_s=500.0)
+    guarded.clock.sleep(1.5)
+    tripped, ended = guarded.interventions
+    most_uN = max(sample.raw_uN for sample in guarded.forces)
+    assert most_uN > 1.02 * tripped.value > LIMIT_UN
+    assert ended.value == pytest.approx(most_uN)
+    assert f"(the largest force was {most_uN:.5g} µN)" in ended.reason
+
+
 def test_the_users_own_stop_ends_a_retraction_and_nobody_argues(guarded):
     press_too_hard(guarded)
     guarded.clock.sleep(0.15)
