@@ -111,7 +111,6 @@ class Rig:
             self.close()
             raise ConnectError(f"{len(failures)} of {len(self.devices)} devices could not be opened:", failures)
         if not self.clock.simulated:
-            gc.collect()
             gc.freeze()
 
     def stop(self, *, by: str = "user", reason: str = "") -> None:
