@@ -160,11 +160,8 @@ def identify(record: IndentationRecord, settings: IdentificationSettings | None 
     if best == "slip_corrected":
         protocols[best] = protocols[best].with_weak(_hidden_by_slip(prepared, fits[best], protocols[best]))
     slip = _slip(prepared, protocols, best)
-    if slip is not None and not _may_be_slip(protocols["slip_corrected"]):
-        no_slip = dict.fromkeys(
-            protocols["slip_corrected"].springs_and_damper, f"what it takes for slip is none: {slip.reason}"
-        )
-        protocols["slip_corrected"] = protocols["slip_corrected"].with_weak(no_slip)
+    if slip is not None:
+        protocols["slip_corrected"] = _marked_without_slip(protocols["slip_corrected"], slip)
     notes = notes_on(record, prepared, both_ways=both_ways)
     if settings.protocol not in {None, best}:
         notes.append(f"{settings.protocol} was asked for; {best} would be preferred")
@@ -237,6 +234,13 @@ def _contradicted_by(
 def _may_be_slip(fit: ProtocolFit) -> bool:
     """Whether the slip that a protocol has found can be one, however imprecise; true of one without a slip."""
     return {"slip", "slip_rate"} & set(fit.weak) <= fit.imprecise
+
+
+def _marked_without_slip(fit: ProtocolFit, slip: Slip) -> ProtocolFit:
+    """`slip_corrected`; what rests on a slip that is none is not determined."""
+    if _may_be_slip(fit):
+        return fit
+    return fit.with_weak(dict.fromkeys(fit.springs_and_damper, f"what it takes for slip is none: {slip.reason}"))
 
 
 def _hidden_by_slip(prepared: Prepared, fit: Fit, slipped: ProtocolFit) -> dict[str, str]:

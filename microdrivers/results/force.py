@@ -115,8 +115,8 @@ class VisionCheck(Record):
     """A fresh indentation of the same specimen with the force from the camera alone, against the sensor.
 
     All its frames count, reversals included; in `error_within_range_percent` those that are not `outside_range`, if
-    there are such frames. `left_over_uN` is the largest force that the camera still told where the
-    specimen rested on its way back, flagged MAY_BE_RELEASED, and the sensor felt less than half of it; None if nowhere.
+    there are such frames. `left_over_uN` is the largest force that the camera still told where the specimen rested on
+    its way back, flagged MAY_BE_RELEASED, and the sensor felt less than half of it; None if nowhere.
     `largest_error_s` and `deepest_s` are instants of `ForceTraces.check_*`.
     """
 

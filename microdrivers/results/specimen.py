@@ -12,9 +12,9 @@ import yaml
 from microdrivers.core.errors import ConfigError
 from microdrivers.estimators.force.model import SpecimenModel
 
-_Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 _log = logging.getLogger(__name__)
 
+_Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 _Row = tuple[_Finite, _Finite, _Finite]
 
 

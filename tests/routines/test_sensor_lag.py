@@ -1,5 +1,7 @@
 """What a slow sensor shifts, by simulated records whose force is late."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -60,4 +62,8 @@ def test_what_a_slow_sensor_shifts_is_in_brackets(characterised):
     )
     assert (fast.k1, fast.b) == (True, True)
     assert (slow.k1, slow.k2, slow.b) == (False, False, False)
+    shallow = {name: dataclasses.replace(fit, deepest_um=0.0) for name, fit in run.identification.protocols.items()}
+    unpressed = dataclasses.replace(run.identification, protocols=shallow)
+    setup = run.setup._replace(bandwidth_hz=1.0)
+    assert result_of(run._replace(identification=unpressed, setup=setup)).protocols["single"].identifiable.b
     assert slow.reasons["b"].startswith("with its bandwidth of 1 Hz the sensor is 1.6e+02 ms late, which shifts ")

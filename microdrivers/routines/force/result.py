@@ -102,7 +102,7 @@ def _trusted(run: ForceRun) -> Mapping[ProtocolName, ProtocolFit]:
 
 
 def _shifted_by_lag(fit: ProtocolFit, setup: IndentationSetup) -> dict[str, str]:
-    if setup.bandwidth_hz is None or setup.speed_um_s is None:
+    if setup.bandwidth_hz is None or setup.speed_um_s is None or not fit.deepest_um > 0.0:
         return {}
     late_s = lag_s(setup.bandwidth_hz)
     biases = lag_biases(fit, late_s, speed_um_s=setup.speed_um_s)

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from microdrivers.estimators.force.protocol_fit import ProtocolFit
+from microdrivers.estimators.force.protocol_fit import INTERVAL, ProtocolFit
 from microdrivers.estimators.force.protocols import PROTOCOLS
 
 Array = npt.NDArray[np.float64]
 
-_FACTOR_95 = 1.96
 _SAMPLES = 200
 
 
@@ -29,7 +28,7 @@ def lag_biases(fit: ProtocolFit, late_s: float, *, speed_um_s: float) -> dict[st
     late·dF/dt, projected on the columns of the model. The jump of a damper's force at the contact is left out.
 
     Args:
-        fit: of the record.
+        fit: of the record, to a depth above 0.
         late_s: the lag.
         speed_um_s: of the ramp, > 0.
     """
@@ -41,7 +40,7 @@ def lag_biases(fit: ProtocolFit, late_s: float, *, speed_um_s: float) -> dict[st
         x, v = np.concatenate([x, x]), np.concatenate([v, -v])
         damped = v if fit.b_unloading_uN_s_per_um else np.where(v > 0.0, v, 0.0)
     taken_off = late_s * (fit.k1_uN_per_um + 3.0 * fit.k2_uN_per_um3 * x**2) * v
-    # In cubes of the depth, or x³ would outweigh the others by decades.
+    # x³ over the square of the depth, or it would outweigh the others by decades.
     depth = fit.deepest_um
     columns = np.column_stack([x, x**3 / depth**2, damped])
     k1, k2, b = (-np.linalg.lstsq(columns, taken_off, rcond=None)[0]).tolist()
@@ -50,7 +49,7 @@ def lag_biases(fit: ProtocolFit, late_s: float, *, speed_um_s: float) -> dict[st
 
 def beyond_intervals(biases: Mapping[str, float], covariance: Array) -> dict[str, float]:
     """Those of the biases of k1, k2 and b that are larger than half a 95 % interval; `covariance` is of the three."""
-    half_widths = _FACTOR_95 * np.sqrt(np.diag(covariance).clip(min=0.0))
+    half_widths = INTERVAL * np.sqrt(np.diag(covariance).clip(min=0.0))
     return {
         name: bias
         for (name, bias), half_width in zip(biases.items(), half_widths.tolist(), strict=True)
